@@ -1,0 +1,1 @@
+"""Which Gaussians move: the heart of the paper."""

@@ -1,0 +1,1 @@
+"""The only place that knows both ROS messages and core types."""

@@ -1,0 +1,1 @@
+"""Types, geometry, configuration and errors: no ROS, no files, no clock."""

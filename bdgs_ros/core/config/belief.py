@@ -1,0 +1,24 @@
+"""Parameters of the Bayesian dynamic inference."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from bdgs_ros.core.config.param import param
+
+
+@dataclass(frozen=True)
+class BeliefConfig:
+    """The filter of Eq. 1-4, the fusion of Eq. 5-6 and the mask of Eq. 10-11."""
+
+    enabled: bool = param(True, 'without it labels gate the map directly (Table 6)')
+    multi_view: bool = param(True, 'fuse the evidence of co-visible keyframes, Eq. 5 (Table 6)')
+    decay_rate: float = param(0.05, 'alpha of Eq. 4 and of w_k', unit='1/s', low=0.0, high=100.0)
+    initial: float = param(0.3, 'belief of a new Gaussian', low=0.01, high=0.99)
+    margin: float = param(0.1, 'delta of Eq. 6', low=0.0, high=0.49)
+    ema: float = param(0.6, 'rho of Eq. 10', low=0.01, high=1.0)
+    mask_threshold: float = param(0.7, 'M_g of Eq. 11: rendered below', low=0.5, high=1.0)
+    max_log_odds: float = param(6.0, 'beliefs are clamped at this', low=1.0, high=50.0)
+    views: int = param(8, 'N of Eq. 5: keyframes whose evidence is kept', low=1, high=64)
+    diversity_translation: float = param(0.1, 'tau_t', unit='m', low=0.0, high=10.0)
+    diversity_rotation_deg: float = param(5.0, 'tau_r', unit='deg', low=0.0, high=180.0)

@@ -1,0 +1,65 @@
+"""Parameters of the Gaussian map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from bdgs_ros.core.config.param import param
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """The weights of Eq. 7 and 9, and the depth term that the paper lacks."""
+
+    psim: float = param(0.85, 'lambda_psim of Eq. 7', low=0.0)
+    dynamic: float = param(0.15, 'lambda_dyn of Eq. 7', low=0.0)
+    reg: float = param(0.01, 'lambda_reg of Eq. 7', low=0.0)
+    ssim: float = param(0.2, 'gamma of Eq. 9', low=0.0, high=1.0)
+    depth: float = param(0.2, 'weight of the depth term', unit='1/m', low=0.0)
+
+
+@dataclass(frozen=True)
+class LearningRateConfig:
+    """Adam step sizes."""
+
+    means: float = param(0.0005, 'positions', unit='m', low=0.0)
+    scales: float = param(0.005, 'log scales', low=0.0)
+    quats: float = param(0.002, 'rotations', low=0.0)
+    opacities: float = param(0.05, 'logit opacities', low=0.0)
+    colors: float = param(0.005, 'colours', low=0.0)
+
+
+@dataclass(frozen=True)
+class InsertConfig:
+    """Where new Gaussians come from."""
+
+    silhouette: float = param(0.6, 'the map is empty below', low=0.0, high=1.0)
+    depth_sigma: float = param(5.0, 'and wrong beyond', unit='sigma_z', low=0.5)
+    stride: int = param(2, 'pixels of the mapping image per Gaussian and axis', low=1, high=32)
+    opacity: float = param(0.7, 'opacity of a new Gaussian', low=0.01, high=0.99)
+
+
+@dataclass(frozen=True)
+class PruneConfig:
+    """What is taken out of the map."""
+
+    opacity: float = param(0.05, 'fainter Gaussians go', low=0.0, high=1.0)
+    scale: float = param(0.4, 'larger Gaussians go', unit='m', low=0.001)
+    max_gaussians: int = param(80000, 'budget', low=100)
+
+
+@dataclass(frozen=True)
+class MappingConfig:
+    """The Gaussian map and its optimisation."""
+
+    enabled: bool = param(True, 'without it tracking is keyframe odometry (Table 6)')
+    width: int = param(320, 'image width at which the map is optimised', unit='px', low=40)
+    iterations: int = param(40, 'optimisation steps per keyframe', low=0, high=1000)
+    window: int = param(8, 'newest keyframes in every optimisation', low=1, high=64)
+    threads: int = param(2, 'threads of the rasteriser', low=1, high=64)
+    backend: str = param('auto', 'rasteriser', choices=('auto', 'native', 'torch'))
+    seed: int = param(0, 'of the choice of keyframes', low=0)
+    loss: LossConfig = field(default_factory=LossConfig)
+    rate: LearningRateConfig = field(default_factory=LearningRateConfig)
+    insert: InsertConfig = field(default_factory=InsertConfig)
+    prune: PruneConfig = field(default_factory=PruneConfig)

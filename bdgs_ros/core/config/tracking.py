@@ -1,0 +1,70 @@
+"""Parameters of the tracking stage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from bdgs_ros.core.config.param import param
+
+
+@dataclass(frozen=True)
+class MotionConfig:
+    """Constant-velocity Kalman prediction on SE(3)."""
+
+    enabled: bool = param(True, 'predict with the filter; otherwise start from the last pose')
+    acceleration_sigma: float = param(
+        3.0, 'white-noise acceleration', unit='m/s^2', low=0.0, high=100.0
+    )
+    angular_acceleration_sigma: float = param(
+        10.0, 'white-noise angular acceleration', unit='rad/s^2', low=0.0, high=1000.0
+    )
+    gate_sigma: float = param(
+        6.0, 'measurements further off reset the velocity', unit='sigma', low=1.0, high=100.0
+    )
+
+
+@dataclass(frozen=True)
+class AlignConfig:
+    """Direct RGB-D alignment, coarse to fine."""
+
+    max_iterations: int = param(20, 'Gauss-Newton iterations over all levels', low=1, high=200)
+    coarse_width: int = param(80, 'image width of the coarsest level', unit='px', low=20, high=640)
+    fine_width: int = param(320, 'image width of the finest level', unit='px', low=20, high=1280)
+    huber_intensity: float = param(
+        0.04, 'residual where the kernel turns robust', unit='grey level in [0, 1]', low=1e-4
+    )
+    huber_depth_sigma: float = param(
+        2.0, 'residual where the kernel turns robust', unit='sigma_z', low=0.1
+    )
+    depth_noise: float = param(
+        0.0025, 'sigma_z = depth_noise * z^2, the Kinect model', unit='1/m', low=1e-5
+    )
+
+
+@dataclass(frozen=True)
+class KeyframeConfig:
+    """When a frame becomes a keyframe."""
+
+    translation: float = param(
+        0.08, 'move from the last keyframe over median depth', low=0.0, high=10.0
+    )
+    rotation_deg: float = param(8.0, 'turn from the last keyframe', unit='deg', low=0.0, high=180)
+    overlap: float = param(0.85, 'share of the reference still in view', low=0.0, high=1.0)
+    max_interval: int = param(15, 'frames until a keyframe is forced', low=1, high=1000)
+
+
+@dataclass(frozen=True)
+class TrackingConfig:
+    """The camera pose of every frame."""
+
+    masked: bool = param(True, 'weigh residuals by P(static)')
+    refine: bool = param(True, 'refine against the rendered static map')
+    lost_inlier_ratio: float = param(
+        0.3, 'fewer inliers among the compared pixels: lost', low=0.0, high=1.0
+    )
+    lost_coverage: float = param(
+        0.04, 'smaller share of static pixels compared: lost', low=0.0, high=1.0
+    )
+    motion: MotionConfig = field(default_factory=MotionConfig)
+    align: AlignConfig = field(default_factory=AlignConfig)
+    keyframe: KeyframeConfig = field(default_factory=KeyframeConfig)

@@ -1,0 +1,91 @@
+"""
+Rigid motions as 4x4 matrices `T_a_b`, which map b-coordinates to a: `p_a = T_a_b @ p_b`.
+
+Tangent vectors are `xi = (rho, phi)`, shape (6,): translation part first, in metres, then the
+rotation vector in radians. The exponential follows Sola et al., "A micro Lie theory", Eq. (172).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+Matrix = NDArray[np.float64]
+Vector = NDArray[np.float64]
+
+_SMALL_ANGLE_RAD = 1e-6
+
+
+def identity() -> Matrix:
+    """Return the motion that moves nothing, shape (4, 4)."""
+    return np.eye(4)
+
+
+def from_rotation_translation(rotation: Matrix, translation: Vector) -> Matrix:
+    """Assemble `T` from a rotation, shape (3, 3), and a translation, shape (3,)."""
+    T = np.eye(4)
+    T[:3, :3] = rotation
+    T[:3, 3] = translation
+    return T
+
+
+def inverse(T_a_b: Matrix) -> Matrix:
+    """Return `T_b_a`."""
+    rotation = T_a_b[:3, :3].T
+    return from_rotation_translation(rotation, -rotation @ T_a_b[:3, 3])
+
+
+def hat(vector: Vector) -> Matrix:
+    """Return the skew-symmetric matrix, shape (3, 3), with `hat(a) @ b == cross(a, b)`."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def exp(xi: Vector) -> Matrix:
+    """Map a tangent vector `(rho, phi)`, shape (6,), to a motion, shape (4, 4)."""
+    rho, phi = xi[:3], xi[3:]
+    return from_rotation_translation(
+        Rotation.from_rotvec(phi).as_matrix(), _left_jacobian(phi) @ rho
+    )
+
+
+def log(T_a_b: Matrix) -> Vector:
+    """Map a motion, shape (4, 4), to its tangent vector `(rho, phi)`, shape (6,)."""
+    phi = Rotation.from_matrix(T_a_b[:3, :3]).as_rotvec()
+    rho = np.linalg.solve(_left_jacobian(phi), T_a_b[:3, 3])
+    return np.concatenate([rho, phi])
+
+
+def _left_jacobian(phi: Vector) -> Matrix:
+    angle = float(np.linalg.norm(phi))
+    skew = hat(phi)
+    if angle < _SMALL_ANGLE_RAD:
+        return np.eye(3) + 0.5 * skew
+    return np.asarray(
+        np.eye(3)
+        + (1.0 - np.cos(angle)) / angle**2 * skew
+        + (angle - np.sin(angle)) / angle**3 * (skew @ skew)
+    )
+
+
+def from_position_quat_xyzw(position: Vector, quat_xyzw: Vector) -> Matrix:
+    """Assemble `T` from a position in metres and a quaternion in the order of ROS and TUM."""
+    return from_rotation_translation(Rotation.from_quat(quat_xyzw).as_matrix(), position)
+
+
+def to_position_quat_xyzw(T_a_b: Matrix) -> tuple[Vector, Vector]:
+    """Split `T` into a position, shape (3,), and a quaternion xyzw with w >= 0, shape (4,)."""
+    quat = Rotation.from_matrix(T_a_b[:3, :3]).as_quat(canonical=True)
+    return T_a_b[:3, 3].copy(), np.asarray(quat)
+
+
+def rotation_angle_rad(T_a_b: Matrix) -> float:
+    """Return the angle of the rotation part, in [0, pi]."""
+    return float(np.linalg.norm(Rotation.from_matrix(T_a_b[:3, :3]).as_rotvec()))
+
+
+def orthonormalise(T_a_b: Matrix) -> Matrix:
+    """Project the rotation part back onto SO(3) after many products."""
+    u, _, vt = np.linalg.svd(T_a_b[:3, :3])
+    return from_rotation_translation(u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt, T_a_b[:3, 3])

@@ -1,0 +1,1 @@
+"""Recordings in, bags in and out; no ROS installation needed."""

@@ -1,0 +1,1 @@
+"""RgbdFrame to dynamic prior: who could be moving."""

@@ -1,0 +1,1 @@
+"""The Gaussian map: rendering, growing and optimising it."""

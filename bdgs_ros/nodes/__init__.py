@@ -1,0 +1,1 @@
+"""Thin rclpy nodes: convert, call, publish."""
