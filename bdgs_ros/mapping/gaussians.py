@@ -1,0 +1,146 @@
+"""The Gaussian map: parameters, belief and optimiser state, which grow and shrink together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bdgs_ros.belief.filter import logit, render_mask
+from bdgs_ros.belief.fusion import BeliefTracker, State, decide
+from bdgs_ros.core.config import BeliefConfig
+from bdgs_ros.mapping.rasterize import Gaussians
+
+Array = NDArray[np.float32]
+
+PARAMETERS = ('means', 'quats', 'log_scales', 'logit_opacities', 'colors')
+
+
+@dataclass(frozen=True)
+class NewGaussians:
+    """Gaussians to be added, M of them, isotropic."""
+
+    means: Array  # [M, 3] metres in world
+    scales: Array  # [M] metres
+    colors: Array  # [M, 3] RGB in [0, 1]
+    belief: Array  # [M] P(dynamic)
+
+
+class GaussianMap:
+    """
+    All Gaussians of the map with everything that is remembered about each.
+
+    `parameters` holds the optimised arrays by their names in `PARAMETERS`; `moments` the first
+    and second Adam moments of the same shapes; `keyframe_index` the keyframe that brought each
+    Gaussian, [N] int32; `observations` how often it was seen, [N] int32.
+    """
+
+    def __init__(self, config: BeliefConfig) -> None:
+        self._config = config
+        self.parameters: dict[str, Array] = {
+            'means': np.zeros((0, 3), np.float32),
+            'quats': np.zeros((0, 4), np.float32),
+            'log_scales': np.zeros((0, 3), np.float32),
+            'logit_opacities': np.zeros(0, np.float32),
+            'colors': np.zeros((0, 3), np.float32),
+        }
+        self.moments = {name: _moments_like(self.parameters[name]) for name in PARAMETERS}
+        self.belief = BeliefTracker(config)
+        self.keyframe_index = np.zeros(0, np.int32)
+        self.observations = np.zeros(0, np.int32)
+
+    def __len__(self) -> int:
+        """Return the number of Gaussians."""
+        return len(self.keyframe_index)
+
+    @property
+    def means(self) -> Array:
+        """Centres in world, metres, [N, 3]."""
+        return self.parameters['means']
+
+    @property
+    def quats(self) -> Array:
+        """Rotations, wxyz, not necessarily of unit length, [N, 4]."""
+        return self.parameters['quats']
+
+    @property
+    def log_scales(self) -> Array:
+        """Natural logarithms of the axes' standard deviations in metres, [N, 3]."""
+        return self.parameters['log_scales']
+
+    @property
+    def logit_opacities(self) -> Array:
+        """Opacities before the sigmoid, [N]."""
+        return self.parameters['logit_opacities']
+
+    @property
+    def colors(self) -> Array:
+        """RGB, nominally in [0, 1], [N, 3]."""
+        return self.parameters['colors']
+
+    @property
+    def p_dynamic(self) -> Array:
+        """The smoothed posterior of Eq. 10, [N]."""
+        return self.belief.smoothed
+
+    @property
+    def states(self) -> NDArray[np.uint8]:
+        """The decision of Eq. 6 for each Gaussian, [N]."""
+        return decide(self.belief.belief, self._config.margin)
+
+    @property
+    def static_count(self) -> int:
+        """How many Gaussians Eq. 6 calls static."""
+        return int((self.states == State.STATIC).sum())
+
+    def visible_mask(self) -> NDArray[np.bool_]:
+        """Return M_g of Eq. 11, [N]: True where a Gaussian is rendered."""
+        return render_mask(self.belief.smoothed, self._config.mask_threshold)
+
+    def as_gaussians(self) -> Gaussians:
+        """Return the arrays in the form the rasteriser takes; nothing is copied."""
+        return Gaussians(**self.parameters, p_dynamic=self.p_dynamic)
+
+    def append(self, new: NewGaussians, opacity: float, keyframe_index: int) -> None:
+        """Add Gaussians that came with keyframe number `keyframe_index`."""
+        count = len(new.means)
+        added = {
+            'means': new.means,
+            'quats': np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+            'log_scales': np.repeat(np.log(new.scales)[:, None], 3, axis=1),
+            'logit_opacities': np.full(count, logit(np.array([opacity], np.float32))[0]),
+            'colors': new.colors,
+        }
+        for name in PARAMETERS:
+            block = added[name].astype(np.float32)
+            self.parameters[name] = _join(self.parameters[name], block)
+            old = self.moments[name]
+            self.moments[name] = [_join(m, np.zeros_like(block)) for m in old]
+        self.belief.append(new.belief)
+        self.keyframe_index = _join(self.keyframe_index, np.full(count, keyframe_index, np.int32))
+        self.observations = _join(self.observations, np.zeros(count, np.int32))
+
+    def keep(self, mask: NDArray[np.bool_]) -> None:
+        """Drop the Gaussians where `mask`, shape (N,), is False."""
+        if mask.all():
+            return
+        for name in PARAMETERS:
+            self.parameters[name] = np.ascontiguousarray(self.parameters[name][mask])
+            self.moments[name] = [np.ascontiguousarray(m[mask]) for m in self.moments[name]]
+        self.belief.keep(mask)
+        self.keyframe_index = self.keyframe_index[mask]
+        self.observations = self.observations[mask]
+
+    def megabytes(self) -> float:
+        """Return the size of the parameters and beliefs in memory, without optimiser state."""
+        arrays = [*self.parameters.values(), self.belief.belief, self.keyframe_index]
+        return sum(a.nbytes for a in arrays) / 1e6
+
+
+def _moments_like(array: Array) -> list[Array]:
+    return [np.zeros_like(array), np.zeros_like(array)]
+
+
+def _join(a: NDArray[np.generic], b: NDArray[np.generic]) -> NDArray[np.generic]:
+    return np.ascontiguousarray(np.concatenate([a, b]))

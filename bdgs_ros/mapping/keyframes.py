@@ -1,0 +1,134 @@
+"""Keyframes as mapping keeps them: images by pyramid level, mask and exposure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bdgs_ros.core import se3
+from bdgs_ros.core.camera import PinholeCamera
+from bdgs_ros.core.types import (
+    DYNAMIC_THRESHOLD,
+    DepthImage,
+    Keyframe,
+    Pose,
+    ProbabilityImage,
+)
+
+Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Level:
+    """A keyframe's images at one level of the Gaussian pyramid GP^i of Eq. 12."""
+
+    camera: PinholeCamera
+    color: Array  # [H, W, 3] in [0, 1]
+    depth_m: DepthImage  # [H, W]
+    weight: Array  # [H, W] 1 where static, 0 where something moves
+
+
+@dataclass
+class MapKeyframe:
+    """One keyframe in the map's window."""
+
+    index: int
+    stamp_ns: int
+    T_world_camera: Pose
+    p_dynamic: ProbabilityImage
+    levels: tuple[Level, ...]
+    """Finest first."""
+    exposure: Array = field(default_factory=lambda: np.zeros(2, np.float32))
+    """(log gain, offset): the camera's image is exp(gain) * render + offset."""
+    exposure_moments: list[Array] = field(
+        default_factory=lambda: [np.zeros(2, np.float32), np.zeros(2, np.float32)]
+    )
+    visits: int = 0
+    """How often it was optimised against."""
+
+    @property
+    def T_camera_world(self) -> Pose:
+        """World to camera, shape (4, 4)."""
+        return se3.inverse(self.T_world_camera)
+
+
+def shrink(keyframe: Keyframe, width: int) -> Keyframe:
+    """
+    Bring a keyframe to the map's width: colour averaged, depth sampled, masks grown.
+
+    A depth that is the average of two surfaces lies on neither, so depth takes the nearest pixel;
+    a dynamic pixel must not get lost, so probabilities take the maximum.
+    """
+    frame = keyframe.frame
+    if frame.camera.width <= width:
+        return keyframe
+    camera = frame.camera.scaled(width / frame.camera.width)
+    size = (camera.width, camera.height)
+    color = cv2.resize(frame.color, size, interpolation=cv2.INTER_AREA)
+    depth_m = _sample_depth(frame.depth_m, camera.shape)
+    ratio = max(1, round(frame.camera.width / width))
+    spread = cv2.dilate(keyframe.p_dynamic, np.ones((ratio, ratio), np.uint8))
+    p_dynamic = cv2.resize(spread, size, interpolation=cv2.INTER_NEAREST)
+    small = type(frame)(frame.stamp_ns, np.asarray(color, np.uint8), depth_m, camera)
+    return Keyframe(small, keyframe.T_world_camera, np.asarray(p_dynamic, np.uint8))
+
+
+def _sample_depth(depth_m: DepthImage, shape: tuple[int, int]) -> DepthImage:
+    """Take the nearer-to-median valid depth: the lower median of each 2x2 block's valid pixels."""
+    rows = depth_m.shape[0] // shape[0]
+    columns = depth_m.shape[1] // shape[1]
+    blocks = depth_m[: shape[0] * rows, : shape[1] * columns]
+    blocks = blocks.reshape(shape[0], rows, shape[1], columns).transpose(0, 2, 1, 3)
+    flat = np.sort(blocks.reshape(*shape, rows * columns), axis=2)
+    invalid = (flat == 0).sum(axis=2)
+    valid = flat.shape[2] - invalid
+    middle = np.minimum(invalid + np.maximum(valid - 1, 0) // 2, flat.shape[2] - 1)
+    return np.asarray(np.take_along_axis(flat, middle[..., None], 2)[..., 0], np.float32)
+
+
+def build_levels(
+    color: NDArray[np.uint8],
+    depth_m: DepthImage,
+    dynamic: NDArray[np.bool_],
+    camera: PinholeCamera,
+    count: int,
+) -> tuple[Level, ...]:
+    """
+    Build the pyramid of Eq. 12, finest level first.
+
+    Parameters
+    ----------
+    color, depth_m, dynamic : ndarray, shape (H, W, ...)
+        The keyframe at the map's width; `dynamic` pixels get weight 0.
+    camera : PinholeCamera
+        At that width.
+    count : int
+        Levels, L + 1 in the paper.
+
+    """
+    image = color.astype(np.float32) / np.float32(255)
+    levels = [Level(camera, image, depth_m, 1 - dynamic.astype(np.float32))]
+    for _ in range(count - 1):
+        levels.append(_halve(levels[-1]))
+    return tuple(levels)
+
+
+def _halve(level: Level) -> Level:
+    camera = level.camera.scaled(0.5)
+    size = (camera.width, camera.height)
+    color = cv2.resize(level.color, size, interpolation=cv2.INTER_AREA)
+    weight = cv2.resize(level.weight, size, interpolation=cv2.INTER_AREA)
+    return Level(
+        camera,
+        np.asarray(color, np.float32),
+        _sample_depth(level.depth_m, camera.shape),
+        np.asarray(weight >= 1, np.float32),
+    )
+
+
+def is_dynamic(p_dynamic: ProbabilityImage) -> NDArray[np.bool_]:
+    """Return which pixels are called dynamic."""
+    return np.asarray(p_dynamic >= DYNAMIC_THRESHOLD)
