@@ -108,6 +108,11 @@ class BeliefTracker:
         self.belief = bayes.update(bayes.sigmoid(self._base), self._fused(stamp_ns), self._limit)
         self.smoothed = bayes.smooth(self.belief, self.smoothed, self._config.ema)
 
+    def overwrite(self, belief: Array, where: NDArray[np.bool_]) -> None:
+        """Set beliefs without any filtering, for runs that switch the filter off (Table 6)."""
+        self.belief = np.where(where, belief, self.belief).astype(np.float32)
+        self.smoothed = self.belief.copy()
+
     @property
     def _limit(self) -> float:
         return self._config.max_log_odds

@@ -126,3 +126,9 @@ def evidence(features: Features, config: LikelihoodConfig) -> Array:
         np.float32,
     )
     return np.asarray(features.values @ weights, dtype=np.float32)
+
+
+def label(features: Features) -> Array:
+    """Return the detector's P(dynamic) at each Gaussian, for runs without the filter."""
+    prior = features.values[:, FEATURES.index('prior')] + np.float32(0.5)
+    return np.where(features.values[:, FEATURES.index('agreement')] > 0, prior, 0.5)

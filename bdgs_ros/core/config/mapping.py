@@ -13,7 +13,7 @@ class LossConfig:
 
     psim: float = param(0.85, 'lambda_psim of Eq. 7', low=0.0)
     dynamic: float = param(0.15, 'lambda_dyn of Eq. 7', low=0.0)
-    reg: float = param(0.01, 'lambda_reg of Eq. 7', low=0.0)
+    reg: float = param(1.0, 'lambda_reg of Eq. 7 on the squared norm of Sigma', low=0.0)
     ssim: float = param(0.2, 'gamma of Eq. 9', low=0.0, high=1.0)
     depth: float = param(0.2, 'weight of the depth term', unit='1/m', low=0.0)
 
@@ -27,6 +27,7 @@ class LearningRateConfig:
     quats: float = param(0.002, 'rotations', low=0.0)
     opacities: float = param(0.05, 'logit opacities', low=0.0)
     colors: float = param(0.005, 'colours', low=0.0)
+    exposure: float = param(0.002, 'log gain and offset of a keyframe', low=0.0)
 
 
 @dataclass(frozen=True)
@@ -34,9 +35,20 @@ class InsertConfig:
     """Where new Gaussians come from."""
 
     silhouette: float = param(0.6, 'the map is empty below', low=0.0, high=1.0)
-    depth_sigma: float = param(5.0, 'and wrong beyond', unit='sigma_z', low=0.5)
+    depth_sigma: float = param(5.0, 'nearer than the map beyond this', unit='sigma_z', low=0.5)
     stride: int = param(2, 'pixels of the mapping image per Gaussian and axis', low=1, high=32)
+    sigma_px: float = param(
+        0.6, 'standard deviation of a new Gaussian over the stride', low=0.1, high=5.0
+    )
     opacity: float = param(0.7, 'opacity of a new Gaussian', low=0.01, high=0.99)
+    min_depth: float = param(0.3, 'nearer depths are not used', unit='m', low=0.0)
+    max_depth: float = param(6.0, 'farther depths are not used', unit='m', low=0.1)
+    edge: float = param(
+        0.04, 'depth steps to a neighbour above this share of z are edges', low=0.0, high=1.0
+    )
+    margin_px: int = param(
+        3, 'pixels around a mover where nothing is inserted', unit='px', low=0, high=50
+    )
 
 
 @dataclass(frozen=True)
@@ -46,6 +58,26 @@ class PruneConfig:
     opacity: float = param(0.05, 'fainter Gaussians go', low=0.0, high=1.0)
     scale: float = param(0.4, 'larger Gaussians go', unit='m', low=0.001)
     max_gaussians: int = param(80000, 'budget', low=100)
+
+
+@dataclass(frozen=True)
+class PyramidConfig:
+    """Coarse to fine, Eq. 12 and 13."""
+
+    levels: int = param(3, 'levels of the Gaussian pyramid', low=1, high=5)
+    coarse_share: float = param(
+        0.4, 'share of the iterations on the levels above the finest', low=0.0, high=1.0
+    )
+    opacity_threshold: float = param(
+        0.005, 'tau_0 of Eq. 13; doubles with each level', low=0.0, high=0.5
+    )
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """The view of the map that tracking gets."""
+
+    silhouette: float = param(0.8, 'below, the map counts as empty', low=0.0, high=1.0)
 
 
 @dataclass(frozen=True)
@@ -63,3 +95,5 @@ class MappingConfig:
     rate: LearningRateConfig = field(default_factory=LearningRateConfig)
     insert: InsertConfig = field(default_factory=InsertConfig)
     prune: PruneConfig = field(default_factory=PruneConfig)
+    pyramid: PyramidConfig = field(default_factory=PyramidConfig)
+    model: ModelConfig = field(default_factory=ModelConfig)

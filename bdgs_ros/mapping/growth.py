@@ -1,0 +1,128 @@
+"""Where Gaussians are added, and which are taken out."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bdgs_ros.core.config import BeliefConfig
+from bdgs_ros.core.config.mapping import InsertConfig, PruneConfig
+from bdgs_ros.core.types import DepthImage
+from bdgs_ros.mapping.gaussians import GaussianMap, NewGaussians
+from bdgs_ros.mapping.keyframes import MapKeyframe
+from bdgs_ros.mapping.rasterize import Rendered
+
+Array = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+
+def insertion_candidates(keyframe: MapKeyframe, config: InsertConfig) -> Mask:
+    """
+    Return the pixels of the finest level that may bring a Gaussian, [H, W].
+
+    They have a usable depth, lie on no depth edge (there the sensor mixes two surfaces), and keep
+    a margin from everything that moves.
+    """
+    level = keyframe.levels[0]
+    moving = (level.weight == 0).astype(np.uint8)
+    reach = 2 * config.margin_px + 1
+    far_from_movers = cv2.dilate(moving, np.ones((reach, reach), np.uint8)) == 0
+    return usable_depth(level.depth_m, config) & far_from_movers
+
+
+def usable_depth(depth_m: DepthImage, config: InsertConfig) -> Mask:
+    """Return the pixels of the insertion grid with a depth in range and off edges, [H, W]."""
+    in_range = (depth_m > config.min_depth) & (depth_m < config.max_depth)
+    return in_range & ~depth_edges(depth_m, config.edge) & _grid(depth_m.shape, config.stride)
+
+
+def _grid(shape: tuple[int, ...], stride: int) -> Mask:
+    grid = np.zeros(shape, bool)
+    grid[stride // 2 :: stride, stride // 2 :: stride] = True
+    return grid
+
+
+def depth_edges(depth_m: DepthImage, relative: float) -> Mask:
+    """Return pixels whose 3x3 neighbourhood spans more than `relative` times their depth."""
+    kernel = np.ones((3, 3), np.uint8)
+    far = cv2.dilate(depth_m, kernel)
+    near = cv2.erode(np.where(depth_m > 0, depth_m, np.float32(np.inf)), kernel)
+    return np.asarray((depth_m > 0) & (far - near > relative * depth_m))
+
+
+def empty_pixels(static: Rendered, config: InsertConfig) -> Mask:
+    """Return where the static map shows next to nothing, [H, W]."""
+    return np.asarray(static.silhouette < config.silhouette)
+
+
+def pixels_in_front(
+    depth_m: DepthImage, static: Rendered, everything: Rendered, sigma: Array, count: float
+) -> Mask:
+    """
+    Return where the camera sees something nearer than the static map, [H, W].
+
+    Parameters
+    ----------
+    depth_m : ndarray, shape (H, W)
+        Measured, metres.
+    static, everything : Rendered
+        The static map, and the map with the Gaussians that Eq. 11 hides: what these already
+        explain is not in front of anything any more.
+    sigma : ndarray, shape (H, W)
+        Standard deviation of the measured depth.
+    count : float
+        How many sigma count as nearer.
+
+    """
+    nearer = (depth_m > 0) & (surface_depth(static) - depth_m > count * sigma)
+    return nearer & ~explained(depth_m, everything, sigma, count) & (static.silhouette > 0.5)
+
+
+def explained(depth_m: DepthImage, everything: Rendered, sigma: Array, count: float) -> Mask:
+    """Return where some Gaussian, hidden or not, already lies at the measured depth, [H, W]."""
+    close = np.abs(surface_depth(everything) - depth_m) < count * sigma
+    return np.asarray(close & (everything.silhouette > 0.5))
+
+
+def surface_depth(rendered: Rendered) -> DepthImage:
+    """Return rendered depth over silhouette, metres; 0 where the map is empty."""
+    safe = np.maximum(rendered.silhouette, 1e-6)
+    return np.where(rendered.silhouette > 1e-3, rendered.depth / safe, 0).astype(np.float32)
+
+
+def lift(keyframe: MapKeyframe, pixels: Mask, belief: float, config: InsertConfig) -> NewGaussians:
+    """Turn pixels of a keyframe's finest level into Gaussians in world."""
+    level = keyframe.levels[0]
+    points = level.camera.unproject(level.depth_m)[pixels]
+    T = keyframe.T_world_camera.astype(np.float32)
+    gain, offset = np.exp(keyframe.exposure[0]), keyframe.exposure[1]
+    spacing = points[:, 2] * np.float32(config.stride / level.camera.fx)
+    return NewGaussians(
+        means=points @ T[:3, :3].T + T[:3, 3],
+        scales=np.float32(config.sigma_px) * spacing,
+        colors=(level.color[pixels] - offset) / gain,
+        belief=np.full(len(points), belief, np.float32),
+    )
+
+
+def worth_keeping(gaussians: GaussianMap, config: PruneConfig) -> Mask:
+    """Return which Gaussians are neither too faint, too large nor over the budget, [N]."""
+    faint = gaussians.logit_opacities < np.log(config.opacity / (1 - config.opacity))
+    large = gaussians.log_scales.max(axis=1, initial=-np.inf) > np.log(config.scale)
+    keep = ~(faint | large)
+    excess = int(keep.sum()) - config.max_gaussians
+    if excess > 0:
+        rank = np.where(keep, gaussians.logit_opacities, np.inf)
+        keep[np.argpartition(rank, excess)[:excess]] = False
+    return keep
+
+
+def confirmed_gone(gaussians: GaussianMap, seen_through: Mask, config: BeliefConfig) -> Mask:
+    """
+    Return the Gaussians that may be deleted: believed dynamic, and free space where they were.
+
+    Deletion is delayed on purpose: a Gaussian that is only believed to be dynamic stays frozen
+    and unrendered, so that it can come back.
+    """
+    return np.asarray((gaussians.belief.smoothed > config.delete_above) & seen_through)

@@ -1,0 +1,223 @@
+"""One keyframe after the other into the static Gaussian map, sections 3.2-3.5 of the paper."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bdgs_ros.belief import likelihood
+from bdgs_ros.core import se3
+from bdgs_ros.core.camera import PinholeCamera
+from bdgs_ros.core.config import BeliefConfig, MappingConfig
+from bdgs_ros.core.types import Keyframe, ModelView, Pose, ProbabilityImage
+from bdgs_ros.mapping import growth
+from bdgs_ros.mapping.gaussians import GaussianMap
+from bdgs_ros.mapping.keyframes import MapKeyframe, build_levels, is_dynamic, shrink
+from bdgs_ros.mapping.optimise import Optimiser
+from bdgs_ros.mapping.ply import load_ply, save_ply
+from bdgs_ros.mapping.rasterize import Rendered, render
+
+Mask = NDArray[np.bool_]
+
+_MIN_BLOB_SHARE = 0.002  # of the image; smaller things in front of the map are noise
+
+
+class Mapper:
+    """The static Gaussian map, grown and optimised keyframe by keyframe."""
+
+    def __init__(self, mapping: MappingConfig, belief: BeliefConfig) -> None:
+        self._config = mapping
+        self._belief = belief
+        self._optimiser = Optimiser(mapping)
+        self.frozen = False
+        """Localisation mode: keyframes are answered with a view, the map does not change."""
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the map."""
+        self.map = GaussianMap(self._belief)
+        self.keyframes: list[MapKeyframe] = []
+        self._count = 0
+        self._rng = np.random.default_rng(self._config.seed)
+
+    def process(self, keyframe: Keyframe) -> ModelView | None:
+        """
+        Take a keyframe into the map.
+
+        Parameters
+        ----------
+        keyframe : Keyframe
+            Frame, pose and dynamic prior.
+
+        Returns
+        -------
+        view : ModelView or None
+            The static map at the keyframe's pose; None with `mapping.enabled` off.
+
+        """
+        if not self._config.enabled:
+            return None
+        small = shrink(keyframe, self._config.width)
+        if not self.frozen:
+            self._infer(small)
+            current = self._remember(small)
+            self._insert(current)
+            self._optimiser.run(self.map, current, self._companions())
+            self.map.keep(growth.worth_keeping(self.map, self._config.prune))
+        return self._model_view(small)
+
+    def render(self, T_world_camera: Pose, camera: PinholeCamera) -> Rendered:
+        """Render the static map: what Eq. 11 lets through."""
+        return self._render(T_world_camera, camera, self.map.visible_mask())
+
+    def render_everything(self, T_world_camera: Pose, camera: PinholeCamera) -> Rendered:
+        """Render also the Gaussians that Eq. 11 hides, for the posterior of all that is known."""
+        return self._render(T_world_camera, camera, None)
+
+    def _render(
+        self, T_world_camera: Pose, camera: PinholeCamera, active: Mask | None
+    ) -> Rendered:
+        return render(
+            self.map.as_gaussians(),
+            se3.inverse(T_world_camera),
+            camera,
+            active=active,
+            threads=self._config.threads,
+            backend=self._config.backend,
+        )
+
+    def _infer(self, keyframe: Keyframe) -> None:
+        """Update every belief with what this keyframe says, Eq. 1-6, 10; delete what is gone."""
+        observation = likelihood.Observation(
+            se3.inverse(keyframe.T_world_camera),
+            keyframe.frame.camera,
+            keyframe.frame.color.astype(np.float32) / np.float32(255),
+            keyframe.frame.depth_m,
+            keyframe.p_dynamic,
+        )
+        config = self._belief.likelihood
+        features = likelihood.extract(self.map.means, self.map.colors, observation, config)
+        self.map.observations += features.visible
+        if self._belief.enabled:
+            evidence = likelihood.evidence(features, config)
+            stamp_ns = keyframe.frame.stamp_ns
+            self.map.belief.observe(stamp_ns, keyframe.T_world_camera, evidence)
+        else:
+            self.map.belief.overwrite(likelihood.label(features), features.visible)
+        seen_through = features.values[:, likelihood.FEATURES.index('free_space')] > 0
+        self.map.keep(~growth.confirmed_gone(self.map, seen_through, self._belief))
+
+    def _remember(self, keyframe: Keyframe) -> MapKeyframe:
+        frame = keyframe.frame
+        moving = is_dynamic(keyframe.p_dynamic)
+        if len(self.map):
+            static = self.render(keyframe.T_world_camera, frame.camera)
+            moving |= self._in_front(keyframe, static)
+        levels = build_levels(
+            frame.color, frame.depth_m, moving, frame.camera, self._config.pyramid.levels
+        )
+        current = MapKeyframe(
+            self._count, frame.stamp_ns, keyframe.T_world_camera, keyframe.p_dynamic, levels
+        )
+        if self.keyframes:
+            current.exposure = self.keyframes[-1].exposure.copy()
+        self.keyframes.append(current)
+        self._count += 1
+        return current
+
+    def _in_front(self, keyframe: Keyframe, static: Rendered) -> Mask:
+        """Return where something stands before the static map, without specks."""
+        depth_m = keyframe.frame.depth_m
+        nearer = (
+            (
+                growth.surface_depth(static) - depth_m
+                > self._config.insert.depth_sigma * self._sigma(depth_m)
+            )
+            & (depth_m > 0)
+            & (static.silhouette > 0.5)
+        )
+        return _without_specks(nearer, _MIN_BLOB_SHARE)
+
+    def _sigma(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+        config = self._belief.likelihood
+        return np.asarray(config.depth_floor + config.depth_noise * depth_m**2, np.float32)
+
+    def _insert(self, current: MapKeyframe) -> None:
+        """Add Gaussians where the map is empty and nothing moves; and, hidden, in front of it."""
+        config = self._config.insert
+        level = current.levels[0]
+        if not len(self.map):
+            pixels = growth.insertion_candidates(current, config)
+            self._append(current, pixels, self._belief.initial)
+            return
+        static = self.render(current.T_world_camera, level.camera)
+        everything = self.render_everything(current.T_world_camera, level.camera)
+        candidates = growth.insertion_candidates(current, config)
+        sigma = self._sigma(level.depth_m)
+        known = growth.explained(level.depth_m, everything, sigma, config.depth_sigma)
+        empty = growth.empty_pixels(static, config) & ~known
+        self._append(current, candidates & empty, self._belief.initial)
+        # What stands in front of the map and no detector names may be new furniture: it enters
+        # hidden by Eq. 11, and the filter decides whether it stays.
+        unnamed = ~is_dynamic(current.p_dynamic)
+        in_front = growth.pixels_in_front(
+            level.depth_m, static, everything, sigma, config.depth_sigma
+        )
+        in_front = _without_specks(in_front & unnamed, _MIN_BLOB_SHARE)
+        possible = growth.usable_depth(level.depth_m, config)
+        self._append(current, in_front & possible, self._belief.initial_in_front)
+
+    def _append(self, current: MapKeyframe, pixels: Mask, belief: float) -> None:
+        new = growth.lift(current, pixels, belief, self._config.insert)
+        self.map.append(new, self._config.insert.opacity, current.index)
+
+    def _companions(self) -> list[MapKeyframe]:
+        """Return the window and as many older keyframes at random, in random order."""
+        window = self.keyframes[-self._config.window : -1]
+        older = self.keyframes[: -self._config.window]
+        if older:
+            count = min(len(older), self._config.window // 2)
+            chosen = self._rng.choice(len(older), count, replace=False)
+            window = window + [older[i] for i in chosen]
+        return [window[i] for i in self._rng.permutation(len(window))]
+
+    def _model_view(self, keyframe: Keyframe) -> ModelView:
+        """Render what tracking gets back: the static map and its posterior, as topics carry it."""
+        camera = keyframe.frame.camera
+        static = self.render(keyframe.T_world_camera, camera)
+        known = static.silhouette > self._config.model.silhouette
+        safe = np.maximum(static.silhouette, 1e-6)
+        color = static.color / safe[..., None]
+        return ModelView(
+            keyframe.frame.stamp_ns,
+            keyframe.T_world_camera,
+            camera,
+            np.where(known[..., None], np.clip(color * 255 + 0.5, 0, 255), 0).astype(np.uint8),
+            np.where(known, static.depth / safe, 0).astype(np.float32),
+            _to_probability_image(static.p_dynamic / safe),
+        )
+
+    def save(self, path: Path) -> None:
+        """Write the map as .ply; raises `MapError`."""
+        save_ply(Path(path), self.map)
+
+    def load(self, path: Path) -> None:
+        """Replace the map by one from a .ply; raises `MapError`, and then keeps the old one."""
+        loaded = load_ply(Path(path), self._belief)
+        self.reset()
+        self.map = loaded
+
+
+def _to_probability_image(p_dynamic: NDArray[np.float32]) -> ProbabilityImage:
+    return np.asarray(np.clip(p_dynamic * 255 + 0.5, 0, 255), np.uint8)
+
+
+def _without_specks(mask: Mask, share: float) -> Mask:
+    """Drop connected components smaller than a share of the image."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    large = stats[:, cv2.CC_STAT_AREA] >= share * mask.size
+    large[0] = False
+    return np.asarray(large[labels]) if count > 1 else np.zeros_like(mask)

@@ -1,0 +1,159 @@
+"""The adaptive optimisation of section 3.4 on the pyramid of section 3.5."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bdgs_ros.belief.fusion import State
+from bdgs_ros.core.config import MappingConfig
+from bdgs_ros.mapping import losses
+from bdgs_ros.mapping.gaussians import PARAMETERS, GaussianMap
+from bdgs_ros.mapping.keyframes import Level, MapKeyframe
+from bdgs_ros.mapping.rasterize import FusedResult, LossWeights, adam_step, fused_step
+
+Array = NDArray[np.float32]
+
+
+class Optimiser:
+    """Fit the map to its keyframes: Eq. 7-9 with Adam, coarse to fine by Eq. 12-13."""
+
+    def __init__(self, config: MappingConfig) -> None:
+        self._config = config
+        self._weights = LossWeights(
+            color=config.loss.psim, ssim=config.loss.ssim, depth=config.loss.depth
+        )
+        rate = config.rate
+        self._rates = {
+            'means': rate.means,
+            'quats': rate.quats,
+            'log_scales': rate.scales,
+            'logit_opacities': rate.opacities,
+            'colors': rate.colors,
+        }
+
+    def run(
+        self, gaussians: GaussianMap, newest: MapKeyframe, others: Sequence[MapKeyframe]
+    ) -> list[float]:
+        """
+        Optimise after a new keyframe.
+
+        Parameters
+        ----------
+        gaussians : GaussianMap
+            Changed in place.
+        newest : MapKeyframe
+            Every second iteration looks at it.
+        others : sequence of MapKeyframe
+            The rest of the window and a few older ones; the other iterations take them in turn.
+
+        Returns
+        -------
+        losses : list of float
+            One per iteration, each of its own view.
+
+        """
+        visible = gaussians.visible_mask()
+        schedule = self._schedule(newest, others)
+        return [self._step(gaussians, kf, level, visible) for kf, level in schedule]
+
+    def _schedule(
+        self, newest: MapKeyframe, others: Sequence[MapKeyframe]
+    ) -> Iterator[tuple[MapKeyframe, int]]:
+        """Yield the keyframe and pyramid level of each iteration, i = L, ..., 0 as in Eq. 12."""
+        for i, level in enumerate(self._levels(len(newest.levels))):
+            keyframe = newest if i % 2 == 0 or not others else others[(i // 2) % len(others)]
+            yield keyframe, level
+
+    def _levels(self, count: int) -> Iterator[int]:
+        coarse = round(self._config.iterations * self._config.pyramid.coarse_share)
+        for level in range(count - 1, 0, -1):
+            yield from [level] * (coarse // (count - 1))
+        done = coarse // max(count - 1, 1) * (count - 1)
+        yield from [0] * (self._config.iterations - done)
+
+    def _step(
+        self,
+        gaussians: GaussianMap,
+        keyframe: MapKeyframe,
+        level_index: int,
+        visible: NDArray[np.bool_],
+    ) -> float:
+        level = keyframe.levels[level_index]
+        active = visible & self._opaque_enough(gaussians.logit_opacities, level_index)
+        result = self._photometric(gaussians, keyframe, level, active)
+        gradients = dict(zip(PARAMETERS, result.gradients.parameters(), strict=True))
+        regulariser = self._add_direct_terms(gaussians, gradients, level)
+        touched = result.visibility > 0
+        touched |= gaussians.states == State.DYNAMIC
+        self._adam(gaussians, gradients, touched)
+        self._adapt_exposure(keyframe, result.exposure_gradient)
+        keyframe.visits += 1
+        return result.loss + regulariser
+
+    def _opaque_enough(self, logit_opacities: Array, level_index: int) -> NDArray[np.bool_]:
+        """Eq. 13: alpha_g counts only above tau_i, which grows towards the coarse levels."""
+        threshold = self._config.pyramid.opacity_threshold * 2**level_index
+        if threshold == 0:
+            return np.ones(len(logit_opacities), bool)
+        return np.asarray(logit_opacities > np.log(threshold / (1 - threshold)))
+
+    def _photometric(
+        self,
+        gaussians: GaussianMap,
+        keyframe: MapKeyframe,
+        level: Level,
+        active: NDArray[np.bool_],
+    ) -> FusedResult:
+        """Lambda_psim times Eq. 9 plus the depth term, on pixels where nothing moves."""
+        return fused_step(
+            gaussians.as_gaussians(),
+            keyframe.T_camera_world,
+            level.camera,
+            level.color,
+            level.depth_m,
+            level.weight,
+            self._weights,
+            exposure=(float(keyframe.exposure[0]), float(keyframe.exposure[1])),
+            active=active,
+            threads=self._config.threads,
+            backend=self._config.backend,
+        )
+
+    def _add_direct_terms(
+        self, gaussians: GaussianMap, gradients: dict[str, Array], level: Level
+    ) -> float:
+        """Add the last two terms of Eq. 7; per pixel like the first, so that they compare."""
+        per_pixel = np.float32(1 / level.weight.size)
+        weights = self._config.loss
+        dynamic, gradient = losses.dynamic_penalty(
+            gaussians.logit_opacities, gaussians.states == State.DYNAMIC, gaussians.p_dynamic
+        )
+        gradients['logit_opacities'] += np.float32(weights.dynamic) * per_pixel * gradient
+        large, gradient = losses.covariance_penalty(gaussians.log_scales)
+        gradients['log_scales'] += np.float32(weights.reg) * per_pixel * gradient
+        return float(per_pixel) * (weights.dynamic * dynamic + weights.reg * large)
+
+    def _adam(
+        self, gaussians: GaussianMap, gradients: dict[str, Array], touched: NDArray[np.bool_]
+    ) -> None:
+        for name in PARAMETERS:
+            adam_step(
+                gaussians.parameters[name],
+                gradients[name],
+                *gaussians.moments[name],
+                rate=self._rates[name],
+                rows=touched,
+            )
+
+    def _adapt_exposure(self, keyframe: MapKeyframe, gradient: Array) -> None:
+        """Fit gain and offset of a keyframe; the first keyframe defines the map's exposure."""
+        if keyframe.index == 0:
+            return
+        rows = np.ones(2, bool)
+        moments = keyframe.exposure_moments
+        adam_step(
+            keyframe.exposure, gradient, *moments, rate=self._config.rate.exposure, rows=rows
+        )
