@@ -151,8 +151,9 @@ class BeliefTracker:
         """Sum w_k z_k over the remembered keyframes, the logarithm of the product in Eq. 5."""
         total = np.zeros_like(self._base)
         for view in self._views:
-            elapsed_s = (stamp_ns - view.stamp_ns) * 1e-9
-            total += (
-                np.float32(temporal_weight(self._config.decay_rate, elapsed_s)) * view.evidence
-            )
+            total += self._weight(view, stamp_ns) * view.evidence
         return total
+
+    def _weight(self, view: _View, stamp_ns: int) -> np.float32:
+        elapsed_s = (stamp_ns - view.stamp_ns) * 1e-9
+        return np.float32(temporal_weight(self._config.decay_rate, elapsed_s))

@@ -1,0 +1,59 @@
+"""Algebraic properties of rigid motions."""
+
+import numpy as np
+import pytest
+
+from bdgs_ros.core import se3
+
+
+def random_xi(seed: int, scale: float = 1.0) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=6) * scale
+
+
+@pytest.mark.parametrize('scale', [1e-9, 1e-4, 0.3, 1.0])
+def test_log_inverts_exp(scale: float) -> None:
+    for seed in range(20):
+        xi = random_xi(seed, scale)
+        if np.linalg.norm(xi[3:]) < np.pi:
+            np.testing.assert_allclose(se3.log(se3.exp(xi)), xi, atol=1e-9)
+
+
+def test_exp_is_the_limit_of_small_steps() -> None:
+    xi = random_xi(3)
+    steps = np.linalg.matrix_power(np.eye(4) + _generator(xi) / 2**20, 2**20)
+    np.testing.assert_allclose(se3.exp(xi), steps, atol=1e-5)
+
+
+def _generator(xi: np.ndarray) -> np.ndarray:
+    out = np.zeros((4, 4))
+    out[:3, :3] = se3.hat(xi[3:])
+    out[:3, 3] = xi[:3]
+    return out
+
+
+def test_inverse_cancels() -> None:
+    T = se3.exp(random_xi(1))
+    np.testing.assert_allclose(se3.inverse(T) @ T, np.eye(4), atol=1e-12)
+
+
+def test_quaternion_round_trip_has_positive_w() -> None:
+    for seed in range(20):
+        T = se3.exp(random_xi(seed, 2.0))
+        position, quat = se3.to_position_quat_xyzw(T)
+        assert quat[3] >= 0
+        np.testing.assert_allclose(se3.from_position_quat_xyzw(position, quat), T, atol=1e-12)
+
+
+def test_angle_of_a_quarter_turn() -> None:
+    assert se3.rotation_angle_rad(se3.exp(np.array([1, 2, 3, 0, np.pi / 2, 0]))) == pytest.approx(
+        np.pi / 2
+    )
+
+
+def test_orthonormalise_restores_a_rotation() -> None:
+    T = se3.exp(random_xi(2))
+    noisy = T.copy()
+    noisy[:3, :3] += 1e-4 * np.random.default_rng(0).normal(size=(3, 3))
+    R = se3.orthonormalise(noisy)[:3, :3]
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(R, T[:3, :3], atol=1e-3)
