@@ -1,0 +1,173 @@
+"""The figures of a run: trajectory, labels and renders against what is known to be true."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bdgs_ros.core.camera import PinholeCamera
+from bdgs_ros.core.types import (
+    DYNAMIC_THRESHOLD,
+    ColorImage,
+    DepthImage,
+    Pose,
+    RgbdFrame,
+    Trajectory,
+)
+from bdgs_ros.eval import rendering, trajectory
+from bdgs_ros.eval.metric import Metric
+from bdgs_ros.eval.recorder import Sample
+
+_SEEN = 0.5  # silhouette above which the map says something about a pixel
+
+
+class Render(Protocol):
+    """A view of the static map; see `bdgs_ros.mapping`."""
+
+    @property
+    def color(self) -> NDArray[np.float32]:
+        """Shape (H, W, 3), in [0, 1]."""
+
+    @property
+    def depth(self) -> NDArray[np.float32]:
+        """Shape (H, W), metres, 0 where the map is empty."""
+
+    @property
+    def silhouette(self) -> NDArray[np.float32]:
+        """Shape (H, W), accumulated opacity in [0, 1]."""
+
+
+class Renderer(Protocol):
+    """Whoever can show the static map."""
+
+    def render(self, T_world_camera: Pose, camera: PinholeCamera) -> Render:
+        """Show the static map from a pose."""
+
+
+class Truth(Protocol):
+    """What a synthetic recording knows about each of its frames."""
+
+    def dynamic(self, stamp_ns: int) -> NDArray[np.bool_]:
+        """Return the true mask of moving things, shape (H, W)."""
+
+    def static_color(self, stamp_ns: int) -> ColorImage:
+        """Return the view without anything that moves."""
+
+    def static_depth(self, stamp_ns: int) -> DepthImage:
+        """Return the depth without anything that moves."""
+
+
+@dataclass(frozen=True)
+class View:
+    """A sample with its render."""
+
+    sample: Sample
+    color: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    silhouette: NDArray[np.float32]
+
+
+def render_samples(samples: Sequence[Sample], renderer: Renderer) -> list[View]:
+    """Render the final static map at the estimated pose of every sample."""
+    views = []
+    for sample in samples:
+        render = renderer.render(sample.T_world_camera, sample.frame.camera)
+        views.append(View(sample, render.color, render.depth, render.silhouette))
+    return views
+
+
+def trajectory_metrics(
+    gt: Trajectory, est: Trajectory, frames_expected: int | None = None
+) -> list[Metric]:
+    """
+    Return ATE, coverage, and RPE per frame and, where it is long enough, per second.
+
+    Raises
+    ------
+    EvaluationError
+        If the trajectories cannot be compared.
+
+    """
+    metrics = trajectory.ate(gt, est, frames_expected=frames_expected).metrics()
+    metrics += trajectory.rpe_frames(gt, est).metrics('frame')
+    if est.stamps_ns[-1] - est.stamps_ns[0] > 1.1e9:
+        metrics += trajectory.rpe_seconds(gt, est).metrics('second')
+    return metrics
+
+
+def render_metrics(views: Sequence[View], truth: Truth | None = None) -> list[Metric]:
+    """
+    Score the static map: against the true static view, or the input with moving pixels left out.
+
+    Keyframes, which the map was fitted to, are left out as long as other frames remain. Where
+    truth is known, `psnr_hidden` scores only the pixels that something moving covered.
+
+    Parameters
+    ----------
+    views : sequence of View
+        Renders at estimated poses.
+    truth : Truth, optional
+        Without it, pixels that the run called dynamic do not count.
+
+    Returns
+    -------
+    metrics : list of Metric
+        Means over the views; empty without views.
+
+    """
+    chosen = [v for v in views if not v.sample.is_keyframe] or list(views)
+    if not chosen:
+        return []
+    scores = [_against_input(v) if truth is None else _against_truth(v, truth) for v in chosen]
+    metrics = [
+        Metric(name, _mean([score[name] for score in scores]), unit)
+        for name, unit in _UNITS.items()
+        if name in scores[0]
+    ]
+    return [*metrics, Metric('views_scored', len(chosen))]
+
+
+_UNITS = {
+    'psnr': 'dB',
+    'psnr_exposure_fit': 'dB',
+    'psnr_hidden': 'dB',
+    'ssim': '',
+    'depth_l1': 'cm',
+    'seen': '%',
+}
+
+
+def _against_truth(view: View, truth: Truth) -> dict[str, float]:
+    stamp_ns = view.sample.frame.stamp_ns
+    hidden = np.asarray(truth.dynamic(stamp_ns), dtype=bool)
+    color, depth = truth.static_color(stamp_ns), truth.static_depth(stamp_ns)
+    scores = _scores(view, color, depth, np.ones(hidden.shape, dtype=bool))
+    return {**scores, 'psnr_hidden': rendering.psnr(view.color, color, hidden)}
+
+
+def _against_input(view: View) -> dict[str, float]:
+    frame: RgbdFrame = view.sample.frame
+    static = view.sample.p_dynamic < DYNAMIC_THRESHOLD
+    return _scores(view, frame.color, frame.depth_m, static)
+
+
+def _scores(
+    view: View, color: ColorImage, depth: DepthImage, valid: NDArray[np.bool_]
+) -> dict[str, float]:
+    fitted = rendering.fit_exposure(view.color, color, valid)
+    return {
+        'psnr': rendering.psnr(view.color, color, valid),
+        'psnr_exposure_fit': rendering.psnr(fitted, color, valid),
+        'ssim': rendering.ssim(view.color, color, valid),
+        'depth_l1': 100.0 * rendering.depth_l1(view.depth, depth, valid),
+        'seen': 100.0 * float(np.mean(view.silhouette > _SEEN)),
+    }
+
+
+def _mean(values: Sequence[float]) -> float:
+    known = [v for v in values if np.isfinite(v)]
+    return float(np.mean(known)) if known else float('nan')
