@@ -2,9 +2,73 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from bdgs_ros.core.config.param import param
+
+
+@dataclass(frozen=True)
+class CutConfig:
+    """How a box is cut to the object in it with depth."""
+
+    stride: int = param(3, 'work on every n-th pixel', unit='px', low=1, high=8)
+    near_tolerance: float = param(
+        0.6, 'depth of an object towards the camera', unit='m', low=0.05, high=5.0
+    )
+    far_tolerance: float = param(
+        0.45, 'depth of an object away from the camera', unit='m', low=0.05, high=5.0
+    )
+    near: float = param(
+        0.9, 'objects nearer than this also take the holes of their box', unit='m', low=0.0
+    )
+    margin: float = param(
+        0.06, 'limbs stick out of the box by this share of its size', low=0.0, high=0.5
+    )
+    dilate: int = param(4, 'growth of the mask at its edge', unit='px', low=0, high=32)
+
+
+@dataclass(frozen=True)
+class HoldConfig:
+    """What happens to an object that the network misses in one frame."""
+
+    interval: int = param(1, 'run the network on every n-th frame', low=1, high=30)
+    frames: int = param(4, 'frames that a missed object is held', low=0, high=60)
+    decay: float = param(0.85, 'its score, multiplied per missed frame', low=0.0, high=1.0)
+    min_score: float = param(
+        0.45, 'only objects seen at least this well are held', low=0.0, high=1.0
+    )
+    iou: float = param(0.3, 'overlap that makes two boxes one object', low=0.0, high=1.0)
+
+
+@dataclass(frozen=True)
+class GeometricConfig:
+    """The class-agnostic prior: what stands where an earlier frame saw free space."""
+
+    width: int = param(160, 'image width at which depths are compared', unit='px', low=40)
+    p_dynamic: float = param(0.75, 'prior of what was found', low=0.0, high=1.0)
+    lag: float = param(
+        0.25, 'age of the first frame compared with', unit='s', low=0.02, high=10.0
+    )
+    lags: int = param(4, 'frames compared with, each twice as old as the last', low=1, high=8)
+    threshold_sigma: float = param(
+        6.0, 'nearer than free space by this', unit='sigma_z', low=1.0, high=100.0
+    )
+    threshold_m: float = param(0.06, 'and by this', unit='m', low=0.0, high=5.0)
+    depth_noise: float = param(
+        0.0025, 'sigma_z = depth_noise * z^2, the Kinect model', unit='1/m', low=1e-5
+    )
+    min_area: float = param(
+        0.006, 'smaller regions are dropped', unit='share of the image', low=0.0, high=1.0
+    )
+    share: float = param(
+        0.15, 'of a surface that must have moved in for all of it to move', low=0.0, high=1.0
+    )
+    max_area: float = param(
+        0.75, 'if more of the image seems to move the alignment failed', low=0.0, high=1.0
+    )
+    min_inliers: float = param(
+        0.4, 'alignments with a smaller inlier ratio are not believed', low=0.0, high=1.0
+    )
 
 
 @dataclass(frozen=True)
@@ -19,3 +83,6 @@ class DetectionConfig:
     score_threshold: float = param(0.35, 'detections below are dropped', low=0.0, high=1.0)
     iou_threshold: float = param(0.45, 'overlap for non-maximum suppression', low=0.0, high=1.0)
     geometric: bool = param(True, 'use the depth warp between frames as a prior')
+    cut: CutConfig = field(default_factory=CutConfig)
+    hold: HoldConfig = field(default_factory=HoldConfig)
+    warp: GeometricConfig = field(default_factory=GeometricConfig)
