@@ -63,7 +63,8 @@ def extract(
     Returns
     -------
     features : Features
-        `prior`: detector's P(dynamic) at the projection, centred on 1/2;
+        `prior`: P(dynamic) of the labels at the projection, where depth agrees; silence of the
+        detector is no evidence, since it does not know every mover;
         `free_space`: how far, in sigma_z beyond the gate, the camera saw through the Gaussian,
         saturated at 1; `agreement`: 1 where the measured depth is that of the Gaussian;
         `color`: absolute colour difference where depth agrees; `bias`: 1.
@@ -82,7 +83,7 @@ def extract(
     difference = np.abs(observation.color[row, column] - colors[inside]).mean(axis=1)
     block = np.stack(
         [
-            np.where(agree, prior - 0.5, 0),
+            np.where(agree, prior, 0),
             violation,
             agree,
             np.where(agree, difference, 0),
@@ -130,5 +131,5 @@ def evidence(features: Features, config: LikelihoodConfig) -> Array:
 
 def label(features: Features) -> Array:
     """Return the detector's P(dynamic) at each Gaussian, for runs without the filter."""
-    prior = features.values[:, FEATURES.index('prior')] + np.float32(0.5)
+    prior = features.values[:, FEATURES.index('prior')]
     return np.where(features.values[:, FEATURES.index('agreement')] > 0, prior, 0.5)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,6 +11,7 @@ from bdgs_ros.belief import likelihood
 from bdgs_ros.core import se3
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.config import BeliefConfig, MappingConfig
+from bdgs_ros.core.images import without_specks
 from bdgs_ros.core.types import Keyframe, ModelView, Pose, ProbabilityImage
 from bdgs_ros.mapping import growth
 from bdgs_ros.mapping.gaussians import GaussianMap
@@ -139,7 +139,7 @@ class Mapper:
             & (depth_m > 0)
             & (static.silhouette > 0.5)
         )
-        return _without_specks(nearer, _MIN_BLOB_SHARE)
+        return without_specks(nearer, _MIN_BLOB_SHARE)
 
     def _sigma(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
         config = self._belief.likelihood
@@ -166,7 +166,7 @@ class Mapper:
         in_front = growth.pixels_in_front(
             level.depth_m, static, everything, sigma, config.depth_sigma
         )
-        in_front = _without_specks(in_front & unnamed, _MIN_BLOB_SHARE)
+        in_front = without_specks(in_front & unnamed, _MIN_BLOB_SHARE)
         possible = growth.usable_depth(level.depth_m, config)
         self._append(current, in_front & possible, self._belief.initial_in_front)
 
@@ -213,11 +213,3 @@ class Mapper:
 
 def _to_probability_image(p_dynamic: NDArray[np.float32]) -> ProbabilityImage:
     return np.asarray(np.clip(p_dynamic * 255 + 0.5, 0, 255), np.uint8)
-
-
-def _without_specks(mask: Mask, share: float) -> Mask:
-    """Drop connected components smaller than a share of the image."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
-    large = stats[:, cv2.CC_STAT_AREA] >= share * mask.size
-    large[0] = False
-    return np.asarray(large[labels]) if count > 1 else np.zeros_like(mask)

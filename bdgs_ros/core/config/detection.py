@@ -11,7 +11,7 @@ from bdgs_ros.core.config.param import param
 class CutConfig:
     """How a box is cut to the object in it with depth."""
 
-    stride: int = param(3, 'work on every n-th pixel', unit='px', low=1, high=8)
+    stride: int = param(4, 'work on every n-th pixel', unit='px', low=1, high=8)
     near_tolerance: float = param(
         0.6, 'depth of an object towards the camera', unit='m', low=0.05, high=5.0
     )
@@ -46,9 +46,7 @@ class GeometricConfig:
 
     width: int = param(160, 'image width at which depths are compared', unit='px', low=40)
     p_dynamic: float = param(0.75, 'prior of what was found', low=0.0, high=1.0)
-    lag: float = param(
-        0.25, 'age of the first frame compared with', unit='s', low=0.02, high=10.0
-    )
+    lag: float = param(0.25, 'age of the first frame compared with', unit='s', low=0.02, high=10.0)
     lags: int = param(4, 'frames compared with, each twice as old as the last', low=1, high=8)
     threshold_sigma: float = param(
         6.0, 'nearer than free space by this', unit='sigma_z', low=1.0, high=100.0

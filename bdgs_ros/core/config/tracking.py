@@ -54,6 +54,19 @@ class KeyframeConfig:
 
 
 @dataclass(frozen=True)
+class MoversConfig:
+    """What counts as standing before the static map, whatever the detector says."""
+
+    depth_sigma: float = param(
+        8.0, 'nearer than the map by this', unit='sigma_z', low=1.0, high=100.0
+    )
+    min_share: float = param(
+        0.003, 'smaller things are noise', unit='share of the image', low=0.0, high=1.0
+    )
+    p_dynamic: float = param(0.8, 'probability given to such pixels', low=0.0, high=1.0)
+
+
+@dataclass(frozen=True)
 class TrackingConfig:
     """The camera pose of every frame."""
 
@@ -68,3 +81,4 @@ class TrackingConfig:
     motion: MotionConfig = field(default_factory=MotionConfig)
     align: AlignConfig = field(default_factory=AlignConfig)
     keyframe: KeyframeConfig = field(default_factory=KeyframeConfig)
+    movers: MoversConfig = field(default_factory=MoversConfig)

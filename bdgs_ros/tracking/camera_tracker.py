@@ -1,0 +1,256 @@
+"""
+Where the camera is, frame by frame, section 3.1 of the paper.
+
+Predict, align to the last keyframe, see what moves, refine against the rendered static map,
+decide whether the pose can be trusted and whether the frame becomes a keyframe.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bdgs_ros.core import se3
+from bdgs_ros.core.camera import PinholeCamera
+from bdgs_ros.core.config import TrackingConfig
+from bdgs_ros.core.types import (
+    Labels,
+    ModelView,
+    Pose,
+    ProbabilityImage,
+    RgbdFrame,
+    TrackingResult,
+    TrackingStatus,
+)
+from bdgs_ros.tracking.align import Aligner, AlignResult, ImagePyramid
+from bdgs_ros.tracking.motion import MotionPredictor
+from bdgs_ros.tracking.movers import nearer_than_model
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Reference:
+    """An image with depth and known pose that frames are aligned to."""
+
+    stamp_ns: int
+    T_world_camera: Pose
+    pyramid: ImagePyramid
+    median_depth_m: float
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One alignment, as a pose in world."""
+
+    T_world_camera: Pose
+    quality: AlignResult
+
+
+class CameraTracker:
+    """Camera pose of every frame, relative to keyframes and to the static map."""
+
+    def __init__(self, config: TrackingConfig) -> None:
+        self._config = config
+        self._aligner = Aligner(config.align)
+        self._motion = MotionPredictor(config.motion)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything; the next frame is the first, and the origin of the world."""
+        self._keyframe: Reference | None = None
+        self._model: Reference | None = None
+        self._frames_since_keyframe = 0
+        self._motion.reset()
+
+    def set_model(self, view: ModelView | None) -> None:
+        """Take the static map as rendered at a keyframe, or None where there is no map."""
+        if view is None:
+            return
+        pyramid = self._pyramid(view.color, view.depth_m, view.p_dynamic, view.camera)
+        self._model = Reference(
+            view.stamp_ns, view.T_world_camera, pyramid, _median_depth(view.depth_m)
+        )
+
+    def process(self, frame: RgbdFrame, labels: Labels | None = None) -> TrackingResult:
+        """
+        Estimate the camera pose of the next frame.
+
+        Parameters
+        ----------
+        frame : RgbdFrame
+            Newer than the last one.
+        labels : Labels, optional
+            Dynamic prior; without it every pixel may be static.
+
+        Returns
+        -------
+        result : TrackingResult
+            With status LOST the pose is the prediction and must not be used.
+
+        """
+        prior = self._prior(frame, labels)
+        current = self._pyramid(frame.color, frame.depth_m, prior, frame.camera)
+        if self._keyframe is None:
+            return self._start(frame, current, prior)
+        predicted, _ = self._motion.predict(frame.stamp_ns)
+        coarse = self._align(self._keyframe, current, predicted)
+        p_dynamic = self._see_movers(prior, current, coarse)
+        fine = self._refine(frame, current, prior, p_dynamic, coarse)
+        return self._conclude(frame, fine, p_dynamic, predicted)
+
+    def _prior(self, frame: RgbdFrame, labels: Labels | None) -> ProbabilityImage:
+        if labels is None or not self._config.masked:
+            return np.zeros(frame.camera.shape, np.uint8)
+        return labels.p_dynamic
+
+    def _pyramid(
+        self,
+        color: NDArray[np.uint8],
+        depth_m: NDArray[np.float32],
+        p_dynamic: ProbabilityImage,
+        camera: PinholeCamera,
+    ) -> ImagePyramid:
+        return self._aligner.pyramid(color, depth_m, p_dynamic, camera)
+
+    def _start(
+        self, frame: RgbdFrame, current: ImagePyramid, p_dynamic: ProbabilityImage
+    ) -> TrackingResult:
+        """Make the first frame the origin of the world and a keyframe."""
+        T_world_camera, covariance = se3.identity(), 1e-6 * np.eye(6)
+        self._motion.update(frame.stamp_ns, T_world_camera, covariance)
+        self._become_keyframe(frame, T_world_camera, current)
+        return TrackingResult(
+            frame.stamp_ns,
+            TrackingStatus.OK,
+            T_world_camera,
+            covariance,
+            True,
+            p_dynamic,
+            1.0,
+            1.0,
+        )
+
+    def _align(
+        self, reference: Reference, current: ImagePyramid, guess: Pose, fine_only: bool = False
+    ) -> Estimate:
+        T_current_reference = se3.inverse(guess) @ reference.T_world_camera
+        quality = self._aligner.align(
+            reference.pyramid, current, T_current_reference, fine_only=fine_only
+        )
+        T_world_camera = reference.T_world_camera @ se3.inverse(quality.T_current_reference)
+        return Estimate(se3.orthonormalise(T_world_camera), quality)
+
+    def _see_movers(
+        self, prior: ProbabilityImage, current: ImagePyramid, coarse: Estimate
+    ) -> ProbabilityImage:
+        """Join the prior with what stands nearer than the static map (class-agnostic prior)."""
+        if self._model is None or not self._config.masked:
+            return prior
+        T_current_model = se3.inverse(coarse.T_world_camera) @ self._model.T_world_camera
+        maps = self._aligner.residual_maps(self._model.pyramid, current, T_current_model)
+        return np.maximum(prior, nearer_than_model(maps, prior.shape, self._config.movers))
+
+    def _refine(
+        self,
+        frame: RgbdFrame,
+        current: ImagePyramid,
+        prior: ProbabilityImage,
+        p_dynamic: ProbabilityImage,
+        coarse: Estimate,
+    ) -> Estimate:
+        """Align to the rendered static map, starting from the coarse pose."""
+        if self._model is None or not self._config.refine:
+            return coarse
+        if p_dynamic is not prior:
+            current = self._pyramid(frame.color, frame.depth_m, p_dynamic, frame.camera)
+        fine = self._align(self._model, current, coarse.T_world_camera, fine_only=True)
+        return fine if self._is_good(fine.quality) else coarse
+
+    def _is_good(self, quality: AlignResult) -> bool:
+        return (
+            quality.inlier_ratio >= self._config.lost_inlier_ratio
+            and quality.coverage >= self._config.lost_coverage
+        )
+
+    def _conclude(
+        self,
+        frame: RgbdFrame,
+        estimate: Estimate,
+        p_dynamic: ProbabilityImage,
+        predicted: Pose,
+    ) -> TrackingResult:
+        quality = estimate.quality
+        self._frames_since_keyframe += 1
+        if not self._is_good(quality):
+            return self._lost(frame, predicted, p_dynamic, quality)
+        self._motion.update(frame.stamp_ns, estimate.T_world_camera, quality.covariance)
+        is_keyframe = self._needs_keyframe(estimate)
+        if is_keyframe:
+            current = self._pyramid(frame.color, frame.depth_m, p_dynamic, frame.camera)
+            self._become_keyframe(frame, estimate.T_world_camera, current)
+        return TrackingResult(
+            frame.stamp_ns,
+            TrackingStatus.OK,
+            estimate.T_world_camera,
+            quality.covariance,
+            is_keyframe,
+            p_dynamic,
+            quality.inlier_ratio,
+            quality.overlap,
+        )
+
+    def _lost(
+        self,
+        frame: RgbdFrame,
+        predicted: Pose,
+        p_dynamic: ProbabilityImage,
+        quality: AlignResult,
+    ) -> TrackingResult:
+        """Report loss; the next frames try again from where the camera was last seen."""
+        _log.warning(
+            'lost at stamp %d ns: %.0f %% inliers on %.0f %% of the image',
+            frame.stamp_ns,
+            100 * quality.inlier_ratio,
+            100 * quality.coverage,
+        )
+        return TrackingResult(
+            frame.stamp_ns,
+            TrackingStatus.LOST,
+            predicted,
+            quality.covariance,
+            False,
+            p_dynamic,
+            quality.inlier_ratio,
+            quality.overlap,
+        )
+
+    def _needs_keyframe(self, estimate: Estimate) -> bool:
+        """Choose by translation over depth, rotation, overlap and age."""
+        assert self._keyframe is not None
+        rules = self._config.keyframe
+        T_keyframe_current = se3.inverse(self._keyframe.T_world_camera) @ estimate.T_world_camera
+        move = float(np.linalg.norm(T_keyframe_current[:3, 3])) / self._keyframe.median_depth_m
+        turn = np.rad2deg(se3.rotation_angle_rad(T_keyframe_current))
+        return bool(
+            move > rules.translation
+            or turn > rules.rotation_deg
+            or estimate.quality.overlap < rules.overlap
+            or self._frames_since_keyframe >= rules.max_interval
+        )
+
+    def _become_keyframe(
+        self, frame: RgbdFrame, T_world_camera: Pose, pyramid: ImagePyramid
+    ) -> None:
+        self._keyframe = Reference(
+            frame.stamp_ns, T_world_camera, pyramid, _median_depth(frame.depth_m)
+        )
+        self._frames_since_keyframe = 0
+
+
+def _median_depth(depth_m: NDArray[np.float32]) -> float:
+    valid = depth_m[depth_m > 0]
+    return float(np.median(valid)) if len(valid) else 1.0

@@ -1,0 +1,85 @@
+"""What a keyframe says about Gaussians in front of, on and behind the measured surface."""
+
+import numpy as np
+import pytest
+
+from bdgs_ros.belief import likelihood
+from bdgs_ros.belief.likelihood import FEATURES, Observation
+from bdgs_ros.core.camera import PinholeCamera
+from bdgs_ros.core.config.belief import LikelihoodConfig
+
+CAMERA = PinholeCamera(64, 48, 60.0, 60.0, 31.5, 23.5)
+CONFIG = LikelihoodConfig()
+GREY = np.full((1, 3), 0.5, np.float32)
+
+
+def observation(depth: float = 2.0, prior: int = 0, color: float = 0.5) -> Observation:
+    return Observation(
+        np.eye(4),
+        CAMERA,
+        np.full((48, 64, 3), color, np.float32),
+        np.full((48, 64), depth, np.float32),
+        np.full((48, 64), prior, np.uint8),
+    )
+
+
+def evidence_at(z: float, seen: Observation) -> tuple[float, bool]:
+    features = likelihood.extract(np.array([[0, 0, z]], np.float32), GREY, seen, CONFIG)
+    return float(likelihood.evidence(features, CONFIG)[0]), bool(features.visible[0])
+
+
+def test_a_gaussian_on_the_surface_is_static() -> None:
+    value, visible = evidence_at(2.0, observation())
+    assert visible
+    assert value < 0
+
+
+def test_the_same_where_the_detector_fires_is_dynamic() -> None:
+    value, visible = evidence_at(2.0, observation(prior=230))
+    assert visible
+    assert value > 1
+
+
+def test_a_gaussian_behind_someone_gets_no_evidence() -> None:
+    value, visible = evidence_at(3.0, observation(prior=230))
+    assert not visible
+    assert value == 0
+
+
+def test_a_gaussian_that_is_seen_through_is_dynamic_whatever_the_detector_says() -> None:
+    for prior in (0, 230):
+        value, visible = evidence_at(1.0, observation(prior=prior))
+        assert visible
+        assert value > 2
+
+
+def test_another_colour_at_the_same_depth_speaks_for_motion() -> None:
+    same, _ = evidence_at(2.0, observation())
+    other, _ = evidence_at(2.0, observation(color=1.0))
+    assert other > same
+
+
+@pytest.mark.parametrize('point', [(0, 0, -1.0), (0, 0, 0.01), (5, 0, 1.0), (0, -5, 1.0)])
+def test_outside_the_view_there_is_no_evidence(point: tuple[float, ...]) -> None:
+    features = likelihood.extract(np.array([point], np.float32), GREY, observation(), CONFIG)
+    assert not features.visible.any()
+    assert not features.values.any()
+
+
+def test_missing_depth_is_no_evidence() -> None:
+    value, visible = evidence_at(2.0, observation(depth=0.0))
+    assert not visible
+    assert value == 0
+
+
+def test_features_have_names() -> None:
+    features = likelihood.extract(
+        np.zeros((3, 3), np.float32), GREY.repeat(3, 0), observation(), CONFIG
+    )
+    assert features.values.shape == (3, len(FEATURES))
+
+
+def test_label_without_filter_is_the_prior_where_depth_agrees() -> None:
+    means = np.array([[0, 0, 2.0], [0, 0, 3.0]], np.float32)
+    features = likelihood.extract(means, GREY.repeat(2, 0), observation(prior=255), CONFIG)
+    np.testing.assert_allclose(likelihood.label(features), [1.0, 0.5])
