@@ -1,0 +1,272 @@
+"""The colour, depth, camera and ground truth topics of a bag as a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bdgs_ros.core.camera import PinholeCamera
+from bdgs_ros.core.errors import DatasetError
+from bdgs_ros.core.types import ColorImage, DepthImage, StampedPose, Trajectory
+from bdgs_ros.data.associate import MAX_DIFFERENCE_S
+from bdgs_ros.data.bag import BagReader, MessageRef, open_bag
+from bdgs_ros.data.messages import (
+    camera_from_message,
+    color_from_message,
+    depth_from_message,
+    pose_from_message,
+    stamp_ns,
+)
+from bdgs_ros.data.ros1 import openloris_ground_truth, tum_ground_truth
+from bdgs_ros.data.sequence import RecordedSequence
+from bdgs_ros.data.trajectory_io import format_stamp_ns
+from bdgs_ros.data.tum import freiburg_camera
+
+COLOR_TOPIC = '/camera/color/image_raw'
+DEPTH_TOPIC = '/camera/depth/image_raw'
+INFO_TOPIC = '/camera/color/camera_info'
+GROUND_TRUTH_TOPIC = '/ground_truth/pose'
+
+GroundTruthReader = Callable[[BagReader, str], Trajectory | None]
+
+
+def pose_ground_truth(reader: BagReader, camera_frame: str) -> Trajectory | None:
+    """Read the camera's poses from PoseStamped messages."""
+    if GROUND_TRUTH_TOPIC not in reader.topics:
+        return None
+    poses = (
+        StampedPose(stamp_ns(message), pose_from_message(message.pose))
+        for _, message in reader.messages([GROUND_TRUTH_TOPIC])
+    )
+    return Trajectory(tuple(sorted(poses, key=lambda pose: pose.stamp_ns)))
+
+
+@dataclass(frozen=True)
+class TopicLayout:
+    """How somebody names the topics of a registered RGB-D camera."""
+
+    name: str
+    color: str
+    depth: str
+    info: str
+    ground_truth: GroundTruthReader = pose_ground_truth
+
+
+# Depth that is registered to colour comes first: a RealSense also publishes depth that is not.
+LAYOUTS = (
+    TopicLayout(
+        'RealSense',
+        '/camera/camera/color/image_raw',
+        '/camera/camera/aligned_depth_to_color/image_raw',
+        '/camera/camera/color/camera_info',
+    ),
+    TopicLayout(
+        'RealSense, older',
+        COLOR_TOPIC,
+        '/camera/aligned_depth_to_color/image_raw',
+        INFO_TOPIC,
+    ),
+    TopicLayout('bdgs', COLOR_TOPIC, DEPTH_TOPIC, INFO_TOPIC),
+    TopicLayout(
+        'OpenLORIS',
+        '/d400/color/image_raw',
+        '/d400/aligned_depth_to_color/image_raw',
+        '/d400/color/camera_info',
+        openloris_ground_truth,
+    ),
+    TopicLayout(
+        'TUM',
+        '/camera/rgb/image_color',
+        '/camera/depth/image',
+        '/camera/rgb/camera_info',
+        tum_ground_truth,
+    ),
+    TopicLayout(
+        'OpenNI',
+        '/camera/rgb/image_raw',
+        '/camera/depth_registered/image_raw',
+        '/camera/rgb/camera_info',
+    ),
+)
+
+
+class BagRecording:
+    """
+    A recording in a bag.
+
+    Parameters
+    ----------
+    reader : BagReader
+        The open bag; the recording keeps it open.
+    camera : PinholeCamera, optional
+        Use this camera instead of the one in the bag.
+    layout : TopicLayout, optional
+        The names of the topics; recognised by default.
+
+    Raises
+    ------
+    DatasetError
+        If the bag has no known pair of colour and depth topics, or no usable camera.
+
+    """
+
+    def __init__(
+        self,
+        reader: BagReader,
+        camera: PinholeCamera | None = None,
+        layout: TopicLayout | None = None,
+    ) -> None:
+        self.reader = reader
+        self.name = (
+            reader.path.resolve().stem if reader.path.suffix else reader.path.resolve().name
+        )
+        self.layout = layout or recognise(reader)
+        self.camera = camera or self._find_camera()
+        index = reader.index([self.layout.color, self.layout.depth])
+        self._color, self._depth = index[self.layout.color], index[self.layout.depth]
+        self.color_stamps_ns = _stamps(self._color)
+        self.depth_stamps_ns = _stamps(self._depth)
+        self._ground_truth: list[Trajectory | None] = []
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """The poses of the camera; read when first asked for."""
+        if not self._ground_truth:
+            self._ground_truth.append(self._read_ground_truth())
+        return self._ground_truth[0]
+
+    def _read_ground_truth(self) -> Trajectory | None:
+        if not self._color:
+            return None
+        frame = str(self._message(self.layout.color, self._color[0]).header.frame_id)
+        return self.layout.ground_truth(self.reader, frame)
+
+    def _find_camera(self) -> PinholeCamera:
+        """Prefer the published calibration of TUM: their folder and bag must agree."""
+        published = freiburg_camera(self.name) if self.reader.storage == 'ros1' else None
+        if published is not None:
+            return published.camera
+        if self.layout.info in self.reader.topics:
+            for _, message in self.reader.messages([self.layout.info]):
+                return camera_from_message(message, self.layout.info)
+        raise DatasetError(
+            f"'{self.reader.path}' has no message on '{self.layout.info}'; "
+            'give the camera with --camera'
+        )
+
+    def color_name(self, index: int) -> str:
+        """Return topic and stamp of a colour image."""
+        return f'{self.layout.color}@{format_stamp_ns(self._color[index].stamp_ns)}'
+
+    def read_color(self, index: int) -> ColorImage:
+        """Read one colour image, distorted."""
+        return self._to_color(self.reader.read(self.layout.color, self._color[index]))
+
+    def read_depth(self, index: int) -> DepthImage:
+        """Read one depth image in metres, distorted."""
+        return self._to_depth(self.reader.read(self.layout.depth, self._depth[index]))
+
+    def _message(self, topic: str, ref: MessageRef) -> Any:
+        return self.reader.deserialize(
+            self.reader.read(topic, ref), self.reader.topics[topic].msgtype
+        )
+
+    def _to_color(self, data: bytes) -> ColorImage:
+        topic = self.layout.color
+        image = color_from_message(
+            self.reader.deserialize(data, self.reader.topics[topic].msgtype), topic
+        )
+        self._check_size(topic, image.shape[:2])
+        return image
+
+    def _to_depth(self, data: bytes) -> DepthImage:
+        topic = self.layout.depth
+        image = depth_from_message(
+            self.reader.deserialize(data, self.reader.topics[topic].msgtype), topic
+        )
+        self._check_size(topic, image.shape)
+        return image
+
+    def _check_size(self, topic: str, shape: tuple[int, ...]) -> None:
+        if shape != self.camera.shape:
+            raise DatasetError(
+                f"topic '{topic}': expected images of shape {self.camera.shape} as in "
+                f"'{self.layout.info}', received {shape}; depth must be registered to colour"
+            )
+
+    def read_pairs(self, pairs: list[tuple[int, int]]) -> Iterator[tuple[ColorImage, DepthImage]]:
+        """Read many pairs in the order given: one by one if that is cheap, else in one pass."""
+        if self.reader.has_random_access:
+            for color, depth in pairs:
+                yield self.read_color(color), self.read_depth(depth)
+        else:
+            yield from self._stream_pairs(pairs)
+
+    def _stream_pairs(
+        self, pairs: list[tuple[int, int]]
+    ) -> Iterator[tuple[ColorImage, DepthImage]]:
+        keys = [
+            (_key(self.layout.color, self._color[i]), _key(self.layout.depth, self._depth[j]))
+            for i, j in pairs
+        ]
+        wanted = {key for pair in keys for key in pair}
+        held: dict[_Key, bytes] = {}
+        incoming = self._keyed_messages()
+        for color_key, depth_key in keys:
+            while color_key not in held or depth_key not in held:
+                key, data = next(incoming)
+                if key in wanted:
+                    held[key] = data
+            yield self._to_color(held.pop(color_key)), self._to_depth(held.pop(depth_key))
+
+    def _keyed_messages(self) -> Iterator[tuple[_Key, bytes]]:
+        last: dict[str, _Key] = {}
+        for raw in self.reader.raw_messages([self.layout.color, self.layout.depth]):
+            before = last.get(raw.topic)
+            again = before is not None and before[1] == raw.stamp_ns
+            nth = before[2] + 1 if before is not None and again else 0
+            last[raw.topic] = (raw.topic, raw.stamp_ns, nth)
+            yield last[raw.topic], raw.data
+
+
+_Key = tuple[str, int, int]
+
+
+def _key(topic: str, ref: MessageRef) -> _Key:
+    return topic, ref.log_ns, ref.nth
+
+
+def _stamps(refs: list[MessageRef]) -> NDArray[np.int64]:
+    return np.array([ref.stamp_ns for ref in refs], dtype=np.int64)
+
+
+def recognise(reader: BagReader) -> TopicLayout:
+    """Find the layout whose colour and depth topics are in the bag; `DatasetError` if none."""
+    for layout in LAYOUTS:
+        if layout.color in reader.topics and layout.depth in reader.topics:
+            return layout
+    wanted = '\n'.join(f'  {x.name}: {x.color} and {x.depth}' for x in LAYOUTS)
+    found = ', '.join(f'{t} ({i.msgtype})' for t, i in sorted(reader.topics.items()))
+    raise DatasetError(
+        f"'{reader.path}' has no known pair of colour and depth topics. Looked for\n{wanted}\n"
+        f'found {found or "no topics"}'
+    )
+
+
+class BagSequence(RecordedSequence):
+    """Rectified frames of a bag."""
+
+    def __init__(
+        self,
+        path: Path | str,
+        camera: PinholeCamera | None = None,
+        max_difference_s: float = MAX_DIFFERENCE_S,
+        allow_truncated: bool = False,
+    ) -> None:
+        recording = BagRecording(open_bag(path, allow_truncated), camera)
+        super().__init__(recording, max_difference_s)

@@ -1,0 +1,223 @@
+"""
+ROS messages as rosbags decodes them, to and from arrays.
+
+The same file serves ROS 1 and ROS 2: rosbags names their fields alike, except in CameraInfo.
+"""
+
+from __future__ import annotations
+
+import sys
+from functools import cache
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
+
+from bdgs_ros.core import se3
+from bdgs_ros.core.camera import PinholeCamera
+from bdgs_ros.core.errors import DatasetError
+from bdgs_ros.core.types import ColorImage, DepthImage, Pose
+from bdgs_ros.data.trajectory_io import NS_PER_S
+
+IMAGE = 'sensor_msgs/msg/Image'
+CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
+POSE_STAMPED = 'geometry_msgs/msg/PoseStamped'
+
+_COLOR_CHANNELS = {'rgb8': 3, 'bgr8': 3, 'rgba8': 4, 'bgra8': 4, 'mono8': 1}
+_TO_RGB = {
+    'bgr8': cv2.COLOR_BGR2RGB,
+    'rgba8': cv2.COLOR_RGBA2RGB,
+    'bgra8': cv2.COLOR_BGRA2RGB,
+    'mono8': cv2.COLOR_GRAY2RGB,
+}
+_DEPTH_TYPES = {'16UC1': 'u2', 'mono16': 'u2', '32FC1': 'f4'}
+_MM_PER_M = np.float32(1000)
+
+
+@cache
+def jazzy() -> Typestore:
+    """Return the message types of ROS 2 Jazzy."""
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def stamp_ns(message: Any) -> int:
+    """Return the header's stamp."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
+
+
+def color_from_message(message: Any, topic: str) -> ColorImage:
+    """
+    Decode a colour Image.
+
+    Raises
+    ------
+    DatasetError
+        If the encoding is not 8-bit colour or grey, or the data do not fill the image.
+
+    """
+    channels = _COLOR_CHANNELS.get(message.encoding)
+    if channels is None:
+        raise _unknown_encoding(message, topic, 'a colour image', _COLOR_CHANNELS)
+    rows = _pixels(message, topic, np.dtype(np.uint8), channels)
+    image = rows if channels == 1 else rows.reshape(message.height, message.width, channels)
+    code = _TO_RGB.get(message.encoding)
+    converted = np.ascontiguousarray(image) if code is None else cv2.cvtColor(image, code)
+    return np.asarray(converted, dtype=np.uint8)
+
+
+def depth_from_message(message: Any, topic: str) -> DepthImage:
+    """
+    Decode a depth Image to metres: `16UC1` counts millimetres, `32FC1` metres, REP 118.
+
+    What is not finite or not positive becomes 0.
+
+    Raises
+    ------
+    DatasetError
+        If the encoding is none of these, or the data do not fill the image.
+
+    """
+    kind = _DEPTH_TYPES.get(message.encoding)
+    if kind is None:
+        raise _unknown_encoding(message, topic, 'a depth image', _DEPTH_TYPES)
+    order = '>' if message.is_bigendian else '<'
+    image = _pixels(message, topic, np.dtype(order + kind), 1)
+    if kind == 'u2':
+        return image.astype(np.float32) / _MM_PER_M
+    depth_m = image.astype(np.float32)
+    depth_m[~(np.isfinite(depth_m) & (depth_m > 0))] = 0
+    return depth_m
+
+
+def _unknown_encoding(message: Any, topic: str, what: str, known: dict[str, Any]) -> DatasetError:
+    return DatasetError(
+        f"topic '{topic}': expected {what} encoded as {', '.join(known)}, "
+        f"received '{message.encoding}'"
+    )
+
+
+def _pixels(message: Any, topic: str, dtype: np.dtype[Any], channels: int) -> NDArray[Any]:
+    """View the data as an array of shape (H, W * channels), without the padding of rows."""
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    row_bytes = width * channels * dtype.itemsize
+    data = np.frombuffer(memoryview(message.data), dtype=np.uint8)
+    if step < row_bytes or data.size < height * step or not height * width:
+        raise DatasetError(
+            f"topic '{topic}': a {width}x{height} '{message.encoding}' image needs rows of at "
+            f'least {row_bytes} bytes, received step {step} and {data.size} bytes'
+        )
+    rows = data[: height * step].reshape(height, step)[:, :row_bytes]
+    return np.ascontiguousarray(rows).view(dtype)
+
+
+def camera_from_message(message: Any, topic: str) -> PinholeCamera:
+    """
+    Read a CameraInfo of ROS 1 or 2.
+
+    Raises
+    ------
+    DatasetError
+        If it is not calibrated, or its distortion is not `plumb_bob`.
+
+    """
+    matrix = [float(value) for value in _field(message, 'k')]
+    coefficients = [float(value) for value in _field(message, 'd')]
+    if matrix[0] <= 0 or matrix[4] <= 0 or not message.width or not message.height:
+        raise DatasetError(
+            f"topic '{topic}': camera_info is not calibrated "
+            f'({message.width}x{message.height}, K = {matrix}); give the camera with --camera'
+        )
+    plumb_bob = message.distortion_model in ('plumb_bob', '') and len(coefficients) <= 5
+    if any(coefficients) and not plumb_bob:
+        raise DatasetError(
+            f"topic '{topic}': expected distortion model 'plumb_bob' with 5 coefficients, "
+            f"received '{message.distortion_model}' with {len(coefficients)}; "
+            'rectify the images first'
+        )
+    k1, k2, p1, p2, k3 = (coefficients + [0.0] * 5)[:5]
+    return PinholeCamera(
+        int(message.width), int(message.height), matrix[0], matrix[4], matrix[2], matrix[5],
+        distortion=(k1, k2, p1, p2, k3),
+    )  # fmt: skip
+
+
+def _field(message: Any, name: str) -> Any:
+    """Return a field that ROS 1 writes in capitals."""
+    return getattr(message, name) if hasattr(message, name) else getattr(message, name.upper())
+
+
+def pose_from_message(pose: Any) -> Pose:
+    """Turn a geometry_msgs Pose into a matrix."""
+    return _pose(pose.position, pose.orientation)
+
+
+def pose_from_transform(transform: Any) -> Pose:
+    """Turn a geometry_msgs Transform into a matrix."""
+    return _pose(transform.translation, transform.rotation)
+
+
+def _pose(position: Any, rotation: Any) -> Pose:
+    return se3.from_position_quat_xyzw(
+        np.array([position.x, position.y, position.z], dtype=float),
+        np.array([rotation.x, rotation.y, rotation.z, rotation.w], dtype=float),
+    )
+
+
+def _header(at_ns: int, frame_id: str) -> Any:
+    types = jazzy().types
+    seconds, nanoseconds = divmod(at_ns, NS_PER_S)
+    stamp = types['builtin_interfaces/msg/Time'](seconds, nanoseconds)
+    return types['std_msgs/msg/Header'](stamp, frame_id)
+
+
+def serialize_image(at_ns: int, frame_id: str, image: NDArray[Any], encoding: str) -> bytes:
+    """Serialise an image array to CDR, in this machine's byte order."""
+    height, width = image.shape[:2]
+    data = np.ascontiguousarray(image).reshape(-1).view(np.uint8)
+    message = jazzy().types[IMAGE](
+        _header(at_ns, frame_id),
+        height,
+        width,
+        encoding,
+        int(sys.byteorder == 'big'),
+        data.size // height,
+        data,
+    )
+    return bytes(jazzy().serialize_cdr(message, IMAGE))
+
+
+def serialize_camera_info(at_ns: int, frame_id: str, camera: PinholeCamera) -> bytes:
+    """Serialise a camera with its distortion to CDR; the projection is of the same intrinsics."""
+    types = jazzy().types
+    projection = np.zeros((3, 4))
+    projection[:, :3] = camera.matrix
+    message = types[CAMERA_INFO](
+        _header(at_ns, frame_id),
+        camera.height,
+        camera.width,
+        'plumb_bob',
+        np.array(camera.distortion),
+        camera.matrix.reshape(-1),
+        np.eye(3).reshape(-1),
+        projection.reshape(-1),
+        0,
+        0,
+        types['sensor_msgs/msg/RegionOfInterest'](0, 0, 0, 0, False),
+    )
+    return bytes(jazzy().serialize_cdr(message, CAMERA_INFO))
+
+
+def serialize_pose(at_ns: int, frame_id: str, T_world_camera: Pose) -> bytes:
+    """Serialise a PoseStamped to CDR."""
+    types = jazzy().types
+    position, quat_xyzw = se3.to_position_quat_xyzw(T_world_camera)
+    pose = types['geometry_msgs/msg/Pose'](
+        types['geometry_msgs/msg/Point'](*(float(value) for value in position)),
+        types['geometry_msgs/msg/Quaternion'](*(float(value) for value in quat_xyzw)),
+    )
+    message = types[POSE_STAMPED](_header(at_ns, frame_id), pose)
+    return bytes(jazzy().serialize_cdr(message, POSE_STAMPED))

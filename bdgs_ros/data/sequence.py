@@ -1,0 +1,193 @@
+"""
+What a recording is, and what the method wants of it.
+
+A `Recording` gives images as the camera gave them: distorted, colour and depth apart, each with
+its own stamp. A `Sequence` gives rectified pairs in order of time. `RecordedSequence` makes the
+second from the first, the same way for every format.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bdgs_ros.core.camera import PinholeCamera, Rectifier
+from bdgs_ros.core.errors import DatasetError
+from bdgs_ros.core.types import ColorImage, DepthImage, RgbdFrame, Trajectory
+from bdgs_ros.data.associate import MAX_DIFFERENCE_S, associate
+from bdgs_ros.data.trajectory_io import seconds_to_ns
+
+_LOGGER = logging.getLogger(__name__)
+_NAMES_SHOWN = 5
+
+
+class Recording(Protocol):
+    """Colour and depth images as recorded, each kind in order of its stamps."""
+
+    @property
+    def name(self) -> str:
+        """What the recording is called."""
+
+    @property
+    def camera(self) -> PinholeCamera:
+        """The colour camera with its distortion; depth is registered to it."""
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """The poses of the camera, where they are known."""
+
+    @property
+    def color_stamps_ns(self) -> NDArray[np.int64]:
+        """Stamps of the colour images, shape (N,)."""
+
+    @property
+    def depth_stamps_ns(self) -> NDArray[np.int64]:
+        """Stamps of the depth images, shape (M,)."""
+
+    def color_name(self, index: int) -> str:
+        """Say which colour image this is, for messages."""
+
+    def read_color(self, index: int) -> ColorImage:
+        """Read one colour image, distorted."""
+
+    def read_depth(self, index: int) -> DepthImage:
+        """Read one depth image in metres, distorted; 0 = invalid."""
+
+    def read_pairs(self, pairs: list[tuple[int, int]]) -> Iterator[tuple[ColorImage, DepthImage]]:
+        """Read many pairs in the order given, in one pass where the format allows it."""
+
+
+class Sequence(Protocol):
+    """Rectified RGB-D frames in order of time."""
+
+    @property
+    def name(self) -> str:
+        """What the recording is called."""
+
+    @property
+    def camera(self) -> PinholeCamera:
+        """The camera with its distortion, as recorded; frames carry the rectified one."""
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """The poses of the camera, where they are known."""
+
+    @property
+    def stamps_ns(self) -> NDArray[np.int64]:
+        """Stamps of the frames (of their colour images), shape (N,)."""
+
+    @property
+    def unpaired_color(self) -> tuple[str, ...]:
+        """Names of the colour images that no depth image is close enough to."""
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+
+    def __getitem__(self, index: int) -> RgbdFrame:
+        """Read one frame."""
+
+    def __iter__(self) -> Iterator[RgbdFrame]:
+        """Read all frames in order."""
+
+
+class RecordedSequence:
+    """
+    The frames of a recording: colour paired with the nearest depth, both rectified.
+
+    Parameters
+    ----------
+    recording : Recording
+        Where the images come from.
+    max_difference_s : float
+        Colour and depth further apart than this are not one frame.
+
+    Raises
+    ------
+    DatasetError
+        If not a single pair can be made.
+
+    """
+
+    def __init__(self, recording: Recording, max_difference_s: float = MAX_DIFFERENCE_S) -> None:
+        self.recording = recording
+        self._pairs = associate(
+            recording.color_stamps_ns, recording.depth_stamps_ns, seconds_to_ns(max_difference_s)
+        )
+        self._rectifier = Rectifier(recording.camera)
+        self.stamps_ns: NDArray[np.int64] = np.array(
+            [recording.color_stamps_ns[i] for i, _ in self._pairs], dtype=np.int64
+        )
+        self.unpaired_color = self._find_unpaired()
+        self._report(max_difference_s)
+
+    @property
+    def name(self) -> str:
+        """What the recording is called."""
+        return self.recording.name
+
+    @property
+    def camera(self) -> PinholeCamera:
+        """The camera with its distortion, as recorded."""
+        return self.recording.camera
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """The poses of the camera, where they are known."""
+        return self.recording.ground_truth
+
+    @property
+    def pairs(self) -> list[tuple[int, int]]:
+        """Indices of the colour and depth image of every frame."""
+        return list(self._pairs)
+
+    def _find_unpaired(self) -> tuple[str, ...]:
+        paired = {i for i, _ in self._pairs}
+        count = len(self.recording.color_stamps_ns)
+        return tuple(self.recording.color_name(i) for i in range(count) if i not in paired)
+
+    def _report(self, max_difference_s: float) -> None:
+        colors, depths = len(self.recording.color_stamps_ns), len(self.recording.depth_stamps_ns)
+        limit_ms = max_difference_s * 1000
+        if not self._pairs:
+            raise DatasetError(
+                f"'{self.name}' has {colors} colour and {depths} depth images but no two within "
+                f'{limit_ms:g} ms of each other; check the recording, or raise --max-difference'
+            )
+        if self.unpaired_color:
+            shown = ', '.join(self.unpaired_color[:_NAMES_SHOWN])
+            more = ', ...' if len(self.unpaired_color) > _NAMES_SHOWN else ''
+            _LOGGER.warning(
+                "'%s': %d of %d colour images have no depth within %g ms: %s%s",
+                self.name, len(self.unpaired_color), colors, limit_ms, shown, more,
+            )  # fmt: skip
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self._pairs)
+
+    def __getitem__(self, index: int) -> RgbdFrame:
+        """Read one frame; negative indices count from the end."""
+        color, depth = self._pairs[index]
+        return self._frame(
+            int(self.stamps_ns[index]),
+            self.recording.read_color(color),
+            self.recording.read_depth(depth),
+        )
+
+    def __iter__(self) -> Iterator[RgbdFrame]:
+        """Read all frames in order, in one pass."""
+        images = self.recording.read_pairs(self._pairs)
+        for stamp_ns, (color, depth_m) in zip(self.stamps_ns, images, strict=True):
+            yield self._frame(int(stamp_ns), color, depth_m)
+
+    def _frame(self, stamp_ns: int, color: ColorImage, depth_m: DepthImage) -> RgbdFrame:
+        return RgbdFrame(
+            stamp_ns,
+            self._rectifier.color(color),
+            self._rectifier.depth(depth_m),
+            self._rectifier.camera,
+        )

@@ -1,0 +1,121 @@
+"""Stamps and trajectories as TUM text files: `stamp x y z qx qy qz qw`, one pose a line."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+
+from bdgs_ros.core import se3
+from bdgs_ros.core.errors import DatasetError
+from bdgs_ros.core.types import StampedPose, Trajectory
+
+NS_PER_S = 1_000_000_000
+_COLUMNS = 8
+
+
+def parse_stamp_ns(text: str) -> int:
+    """
+    Turn a stamp in decimal seconds into integer nanoseconds, without rounding through float.
+
+    Raises
+    ------
+    ValueError
+        If the text is not a finite decimal number.
+
+    """
+    try:
+        return int((Decimal(text) * NS_PER_S).to_integral_value())
+    except (InvalidOperation, OverflowError, ValueError) as error:
+        raise ValueError(f'{text!r} is not a stamp in seconds') from error
+
+
+def format_stamp_ns(stamp_ns: int) -> str:
+    """Write a stamp in seconds with nine decimals."""
+    sign = '-' if stamp_ns < 0 else ''
+    seconds, nanoseconds = divmod(abs(stamp_ns), NS_PER_S)
+    return f'{sign}{seconds}.{nanoseconds:09d}'
+
+
+def seconds_to_ns(seconds: float) -> int:
+    """Convert a duration in seconds to the nearest nanosecond."""
+    return round(seconds * NS_PER_S)
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """
+    Read a trajectory in TUM format, sorted by stamp; lines that start with `#` are comments.
+
+    Raises
+    ------
+    DatasetError
+        If the file is missing, or a line is not eight finite numbers with a rotation.
+
+    """
+    try:
+        lines = path.read_text(encoding='utf-8').splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetError(f"cannot read the trajectory '{path}': {error}") from error
+    poses = [
+        _parse_pose(path, number, line)
+        for number, line in enumerate(lines, start=1)
+        if line.strip() and not line.lstrip().startswith('#')
+    ]
+    return Trajectory(tuple(sorted(poses, key=lambda pose: pose.stamp_ns)))
+
+
+def _parse_pose(path: Path, number: int, line: str) -> StampedPose:
+    words = line.replace(',', ' ').split()
+    try:
+        if len(words) != _COLUMNS:
+            raise ValueError(f'{len(words)} columns')
+        values = np.array([float(word) for word in words[1:]])
+        if not np.isfinite(values).all():
+            raise ValueError('a number that is not finite')
+        if not 0.5 < np.linalg.norm(values[3:]) < 2.0:
+            raise ValueError(f'a quaternion of norm {np.linalg.norm(values[3:]):.3g}')
+        stamp_ns = parse_stamp_ns(words[0])
+    except ValueError as error:
+        raise DatasetError(
+            f"'{path}', line {number}: expected 'stamp x y z qx qy qz qw', found {error}"
+        ) from error
+    return StampedPose(stamp_ns, se3.from_position_quat_xyzw(values[:3], values[3:]))
+
+
+def write_trajectory(path: Path, trajectory: Trajectory) -> None:
+    """
+    Write a trajectory in TUM format; an older file stays intact if anything fails.
+
+    Raises
+    ------
+    DatasetError
+        If the path cannot be written.
+
+    """
+    lines = ['# stamp x y z qx qy qz qw', *(_format_pose(pose) for pose in trajectory.poses)]
+    write_text_atomically(path, '\n'.join(lines) + '\n')
+
+
+def _format_pose(pose: StampedPose) -> str:
+    position, quat_xyzw = se3.to_position_quat_xyzw(pose.T_world_camera)
+    numbers = ' '.join(f'{value:.9f}' for value in (*position, *quat_xyzw))
+    return f'{format_stamp_ns(pose.stamp_ns)} {numbers}'
+
+
+def write_text_atomically(path: Path, text: str) -> None:
+    """Write a text file aside, then rename it over the old one; `DatasetError` if it fails."""
+    temporary: str | None = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f'.{path.name}.')
+        with os.fdopen(descriptor, 'w', encoding='utf-8') as file:
+            file.write(text)
+        Path(temporary).chmod(0o644)
+        Path(temporary).replace(path)
+    except OSError as error:
+        if temporary is not None:
+            Path(temporary).unlink(missing_ok=True)
+        raise DatasetError(f"cannot write '{path}': {error}") from error
