@@ -1,0 +1,101 @@
+"""What a node tells about itself: counts, timings, problems; on /diagnostics once a second."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+
+from bdgs_ros.bridge import topics
+
+_PERIOD_S = 1.0
+_REPEAT_S = 30.0
+_KEPT_TIMINGS = 20000
+
+
+class Health:
+    """
+    Counts, timings and problems of one node.
+
+    Parameters
+    ----------
+    node : Node
+        It logs and publishes.
+    name : str
+        Of the status, for example 'tracking'.
+
+    """
+
+    def __init__(self, node: Node, name: str) -> None:
+        self.counts: Counter[str] = Counter()
+        self._node = node
+        self._name = name
+        self._timings_ms: dict[str, deque[float]] = {}
+        self._problems: dict[str, str] = {}
+        self._logged_s: dict[str, float] = {}
+        self._publisher = node.create_publisher(
+            DiagnosticArray, topics.DIAGNOSTICS, topics.RELIABLE
+        )
+        self._timer = node.create_timer(
+            _PERIOD_S, self.publish, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
+
+    @contextmanager
+    def timed(self, name: str) -> Iterator[None]:
+        """Measure a block."""
+        started = time.perf_counter()
+        yield
+        self.add_timing(name, (time.perf_counter() - started) * 1e3)
+
+    def add_timing(self, name: str, milliseconds: float) -> None:
+        """Add one measurement."""
+        self._timings_ms.setdefault(name, deque(maxlen=_KEPT_TIMINGS)).append(milliseconds)
+
+    def set_problem(self, key: str, text: str) -> None:
+        """Say and log that something is wrong, or with an empty text that it is right again."""
+        self.mark(key, text)
+        if text:
+            self.warn(text)
+
+    def mark(self, key: str, text: str) -> None:
+        """Like `set_problem`, without the log."""
+        if text:
+            self._problems[key] = text
+        else:
+            self._problems.pop(key, None)
+
+    def warn(self, text: str) -> None:
+        """Log a warning; the same text at most twice a minute."""
+        now = time.monotonic()
+        if now - self._logged_s.get(text, -_REPEAT_S) >= _REPEAT_S:
+            self._logged_s[text] = now
+            self._node.get_logger().warning(text)
+
+    def publish(self) -> None:
+        """Send the status now."""
+        status = DiagnosticStatus(
+            level=DiagnosticStatus.WARN if self._problems else DiagnosticStatus.OK,
+            name=f'bdgs_ros: {self._name}',
+            message='; '.join(self._problems.values()) or 'ok',
+            hardware_id=self._node.get_fully_qualified_name(),
+            values=[KeyValue(key=key, value=value) for key, value in self._values().items()],
+        )
+        stamp = self._node.get_clock().now().to_msg()
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = stamp
+        self._publisher.publish(message)
+
+    def _values(self) -> dict[str, str]:
+        values = {key: str(count) for key, count in sorted(self.counts.items())}
+        for name, timings in list(self._timings_ms.items()):
+            measured = np.array(timings)
+            values[f'{name}_ms_median'] = f'{np.median(measured):.2f}'
+            values[f'{name}_ms_p95'] = f'{np.percentile(measured, 95):.2f}'
+        return values

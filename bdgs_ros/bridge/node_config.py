@@ -1,0 +1,162 @@
+"""
+The parameters of the nodes: what the stages' own configs do not know.
+
+ROS-free, so that the reference yaml and the tests can read it anywhere. Every node accepts the
+parameters of all nodes and uses its own: one yaml file serves the whole graph.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from bdgs_ros.core.config import (
+    BeliefConfig,
+    DetectionConfig,
+    MappingConfig,
+    TrackingConfig,
+    param,
+    specs,
+)
+
+
+@dataclass(frozen=True)
+class QosConfig:
+    """How the camera topics travel."""
+
+    reliability: str = param(
+        'reliable',
+        'of the camera topics; live cameras often publish best_effort',
+        choices=('reliable', 'best_effort'),
+    )
+    depth: int = param(10, 'images kept for a slow reader', low=1, high=1000)
+
+
+@dataclass(frozen=True)
+class SyncConfig:
+    """How colour and depth find each other."""
+
+    tolerance_s: float = param(
+        0.03, 'colour and depth further apart are no pair', unit='s', low=0.0, high=1.0
+    )
+    jump_back_s: float = param(
+        1.0, 'stamps that jump back further reset everything', unit='s', low=0.0
+    )
+
+
+@dataclass(frozen=True)
+class GraphConfig:
+    """What every node of the graph shares."""
+
+    mode: str = param(
+        'realtime',
+        'realtime: never wait, drop and count what is late; lockstep: wait, drop nothing',
+        choices=('realtime', 'lockstep'),
+    )
+    lockstep_timeout_s: float = param(
+        60.0, 'lockstep goes on without a peer that is silent', unit='s', low=0.1
+    )
+    silence_s: float = param(
+        3.0, 'a topic silent for longer is warned about', unit='s', low=0.5, high=60.0
+    )
+    qos: QosConfig = field(default_factory=QosConfig)
+    sync: SyncConfig = field(default_factory=SyncConfig)
+
+    @property
+    def lockstep(self) -> bool:
+        """Whether nodes wait for each other."""
+        return self.mode == 'lockstep'
+
+
+@dataclass(frozen=True)
+class DetectionNodeConfig(GraphConfig):
+    """Parameters of detection_node."""
+
+    detection: DetectionConfig = field(default_factory=DetectionConfig)
+
+
+@dataclass(frozen=True)
+class TrackingNodeConfig(GraphConfig):
+    """Parameters of tracking_node."""
+
+    map_frame: str = param('map', 'frame id of the world: x forward, y left, z up at the start')
+    camera_frame: str = param('', 'frame id of the camera; empty: that of the colour image')
+    publish_tf: bool = param(True, 'publish map to camera on /tf where tf2_msgs is installed')
+    path_period_s: float = param(1.0, 'between two messages of the path', unit='s', low=0.0)
+    labels_max_age_s: float = param(
+        0.5, 'older labels are not used (realtime)', unit='s', low=0.0, high=10.0
+    )
+    frame_queue: int = param(5, 'frames that may wait for tracking (realtime)', low=1, high=1000)
+    trajectory_file: str = param('', 'where bdgs/save_trajectory writes; may change at run time')
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+
+
+@dataclass(frozen=True)
+class MappingNodeConfig(GraphConfig):
+    """Parameters of mapping_node."""
+
+    map_frame: str = param('map', 'frame id of the world: x forward, y left, z up at the start')
+    map_file: str = param(
+        '', 'where bdgs/save_map writes and bdgs/load_map reads; may change at run time'
+    )
+    load_at_start: bool = param(False, 'load map_file at the start, if it exists')
+    autosave_s: float = param(0.0, 'save map_file this often; 0: never', unit='s', low=0.0)
+    render_rate: float = param(
+        5.0, 'of bdgs/rendered, while subscribed; 0: never', unit='Hz', low=0.0, high=1000.0
+    )
+    map_period_s: float = param(2.0, 'between two messages of bdgs/map', unit='s', low=0.0)
+    keyframe_queue: int = param(
+        2, 'keyframes that may wait for mapping (realtime)', low=1, high=1000
+    )
+    frame_buffer: int = param(60, 'frames kept until their keyframe arrives', low=2, high=10000)
+    mapping: MappingConfig = field(default_factory=MappingConfig)
+    belief: BeliefConfig = field(default_factory=BeliefConfig)
+
+
+@dataclass(frozen=True)
+class ReplayConfig(GraphConfig):
+    """Parameters of replay_node."""
+
+    bag: str = param('', 'path of the recording: a rosbag2 folder or file, or a ROS 1 .bag')
+    rate: float = param(1.0, 'speed of real-time replay', low=0.01, high=100.0)
+    start: float = param(0.0, 'offset into the recording', unit='s', low=0.0)
+    duration: float = param(0.0, 'how much to play; 0: all', unit='s', low=0.0)
+    loop: bool = param(False, 'begin again at the end')
+    paused: bool = param(False, 'start paused; bdgs/replay/pause and bdgs/replay/step go on')
+    wait_subscribers: int = param(
+        1, 'subscribers of the colour topic to wait for before the start', low=0, high=100
+    )
+    wait_timeout_s: float = param(
+        30.0, 'then start anyway, with a warning', unit='s', low=0.0, high=3600.0
+    )
+    color_topic: str = param('', 'colour topic in the bag; empty: found by its name')
+    depth_topic: str = param('', 'depth topic in the bag; empty: found by its name')
+    info_topic: str = param('', 'camera_info topic in the bag; empty: found by its name')
+
+
+@dataclass(frozen=True)
+class SlamConfig(GraphConfig):
+    """Parameters of slam_node itself; it hands everything else to the nodes it starts."""
+
+    bag: str = param('', 'recording to replay through the graph; empty: wait for a camera')
+    output: str = param('', 'folder for trajectory.txt, map.ply and metrics.json')
+    exit_at_end: bool = param(False, 'write the results and stop when the recording is over')
+    processes: str = param(
+        'several',
+        'one process per node, or all nodes in this one',
+        choices=('one', 'several'),
+    )
+    respawns: int = param(3, 'times that a dead node is started again', low=0, high=1000)
+
+
+NODE_CONFIGS: dict[str, type[GraphConfig]] = {
+    'detection_node': DetectionNodeConfig,
+    'tracking_node': TrackingNodeConfig,
+    'mapping_node': MappingNodeConfig,
+    'replay_node': ReplayConfig,
+    'slam_node': SlamConfig,
+}
+
+
+def known_names() -> list[str]:
+    """Return the name of every parameter that any node has, sorted."""
+    return sorted({spec.name for config in NODE_CONFIGS.values() for spec in specs(config())})

@@ -1,0 +1,64 @@
+"""Topic and service names, frame ids and quality of service: each named once."""
+
+from __future__ import annotations
+
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+from bdgs_ros.bridge.node_config import QosConfig
+
+COLOR = 'camera/color/image_raw'
+COLOR_INFO = 'camera/color/camera_info'
+DEPTH = 'camera/depth/image_raw'
+
+LABELS = 'bdgs/labels'
+DETECTIONS = 'bdgs/detections'
+POSE = 'bdgs/pose'
+ODOMETRY = 'bdgs/odometry'
+PATH = 'bdgs/path'
+STATUS = 'bdgs/status'
+"""One message per image that tracking took: the acknowledgement that lockstep waits for."""
+KEYFRAME = 'bdgs/keyframe'
+MODEL_IMAGE = 'bdgs/model/image'
+MODEL_DEPTH = 'bdgs/model/depth'
+MODEL_DYNAMIC = 'bdgs/model/dynamic'
+RENDERED_IMAGE = 'bdgs/rendered/image'
+RENDERED_DEPTH = 'bdgs/rendered/depth'
+DYNAMIC_PROBABILITY = 'bdgs/dynamic_probability'
+MAP = 'bdgs/map'
+RESET_EVENT = 'bdgs/reset_event'
+"""Tracking tells the other nodes that it forgot everything."""
+
+TF = '/tf'
+CLOCK = '/clock'
+DIAGNOSTICS = '/diagnostics'
+
+RESET = 'bdgs/reset'
+PAUSE = 'bdgs/pause'
+SET_LOCALIZATION_MODE = 'bdgs/set_localization_mode'
+SAVE_MAP = 'bdgs/save_map'
+LOAD_MAP = 'bdgs/load_map'
+SAVE_TRAJECTORY = 'bdgs/save_trajectory'
+REPLAY_PAUSE = 'bdgs/replay/pause'
+REPLAY_STEP = 'bdgs/replay/step'
+
+RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+"""Small messages: every one counts, late ones still do."""
+LATCHED = QoSProfile(
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+"""The last message waits for subscribers that come late."""
+
+
+def image_qos(config: QosConfig) -> QoSProfile:
+    """Return the profile of the camera topics, which live drivers may publish best-effort."""
+    policies = {
+        'reliable': ReliabilityPolicy.RELIABLE,
+        'best_effort': ReliabilityPolicy.BEST_EFFORT,
+    }
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=config.depth,
+        reliability=policies[config.reliability],
+    )

@@ -1,0 +1,112 @@
+"""A thread that works through a queue, so that callbacks never wait; ROS-free."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+Item = TypeVar('Item')
+
+
+class Worker(Generic[Item]):
+    """
+    Handle items in order in a thread of its own.
+
+    Parameters
+    ----------
+    handle : callable
+        Called with each item.
+    on_error : callable
+        Called with what `handle` raised; the thread goes on.
+    capacity : int or None
+        Items that may wait; the oldest is dropped for a newer one. None: all wait.
+    idle : callable, optional
+        Called after every item and `idle_period_s` after the last call while nothing is to do.
+    idle_period_s : float
+        See `idle`.
+
+    """
+
+    def __init__(
+        self,
+        handle: Callable[[Item], None],
+        on_error: Callable[[Exception], None],
+        capacity: int | None,
+        idle: Callable[[], None] = lambda: None,
+        idle_period_s: float = 0.1,
+    ) -> None:
+        self.dropped = 0
+        self._handle = handle
+        self._on_error = on_error
+        self._capacity = capacity
+        self._idle = idle
+        self._idle_period_s = idle_period_s
+        self._items: deque[Item] = deque()
+        self._changed = threading.Condition()
+        self._busy = False
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def put(self, item: Item) -> None:
+        """Append an item; never waits."""
+        with self._changed:
+            if self._capacity is not None and len(self._items) >= self._capacity:
+                self._items.popleft()
+                self.dropped += 1
+            self._items.append(item)
+            self._changed.notify_all()
+
+    def clear(self) -> None:
+        """Forget what waits."""
+        with self._changed:
+            self._items.clear()
+
+    def wait_idle(self, timeout_s: float) -> bool:
+        """Return whether everything was handled within a time."""
+        deadline = time.monotonic() + timeout_s
+        with self._changed:
+            while self._items or self._busy:
+                left = deadline - time.monotonic()
+                if left <= 0:
+                    return False
+                self._changed.wait(left)
+        return True
+
+    def stop(self, timeout_s: float = 2.0) -> None:
+        """Finish the item at hand and end the thread."""
+        with self._changed:
+            self._stopping = True
+            self._items.clear()
+            self._changed.notify_all()
+        self._thread.join(timeout_s)
+
+    def _run(self) -> None:
+        while not self._stopping:
+            item = self._next()
+            if item is not None:
+                self._guarded(lambda item=item: self._handle(item[0]))
+                with self._changed:
+                    self._busy = False
+                    self._changed.notify_all()
+            if not self._stopping:
+                self._guarded(self._idle)
+
+    def _next(self) -> tuple[Item] | None:
+        with self._changed:
+            if not self._items and not self._stopping:
+                self._changed.wait(self._idle_period_s)
+            if not self._items or self._stopping:
+                return None
+            self._busy = True
+            return (self._items.popleft(),)
+
+    def _guarded(self, call: Callable[[], None]) -> None:
+        try:
+            call()
+        except Exception as error:  # whatever it was, the next item must be handled
+            if not self._stopping:
+                self._on_error(error)

@@ -1,0 +1,96 @@
+"""Publish the dynamic prior of every colour image."""
+
+from __future__ import annotations
+
+import sys
+
+import cv2
+import numpy as np
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import Image
+from std_msgs.msg import Empty
+
+from bdgs_ros.bridge import conversions, optional, parameters, topics
+from bdgs_ros.bridge.frames import FrameDecoder, FrameSource, RawFrame
+from bdgs_ros.bridge.health import Health
+from bdgs_ros.bridge.node_config import DetectionNodeConfig
+from bdgs_ros.bridge.runner import GraphNode, run
+from bdgs_ros.bridge.worker import Worker
+from bdgs_ros.core.config import DetectionConfig, with_values
+from bdgs_ros.core.errors import DatasetError, ModelError
+from bdgs_ros.core.types import Labels
+from bdgs_ros.detection.stage import DetectionStage
+
+
+class DetectionNode(GraphNode):
+    """Who could be moving: `bdgs/labels`, for the colour image of the same stamp."""
+
+    def __init__(self, overrides: list[Parameter] | None = None) -> None:
+        super().__init__('detection_node', parameter_overrides=overrides)
+        config = parameters.declare(self, DetectionNodeConfig())
+        cv2.setNumThreads(1)
+        self._health = Health(self, 'detection')
+        self._stage = self._make_stage(config.detection)
+        self._labels = self.create_publisher(Image, topics.LABELS, topics.RELIABLE)
+        self._detections = optional.DetectionsPublisher(self)
+        self._decoder = FrameDecoder.of(self)
+        # Only the newest image is worth a detector's time; in lockstep, all are.
+        self._worker: Worker[RawFrame] = Worker(
+            self._on_frame, self._on_error, None if config.lockstep else 1
+        )
+        self._source = FrameSource(self, config, self._health, self._worker.put, self._reset)
+        self.create_subscription(
+            Empty, topics.RESET_EVENT, lambda _: self._reset(), topics.RELIABLE
+        )
+        self.get_logger().info(f'detection is ready: mode {config.mode}')
+
+    def _make_stage(self, config: DetectionConfig) -> DetectionStage:
+        try:
+            return DetectionStage(config)
+        except ModelError as error:
+            self._health.set_problem('weights', f'{error}; going on with the geometric prior')
+            return DetectionStage(with_values(config, {'weights': ''}))
+
+    def _on_frame(self, raw: RawFrame) -> None:
+        try:
+            frame = self._decoder.decode(raw)
+        except DatasetError as error:
+            self._health.counts['frames_skipped'] += 1
+            self._health.warn(str(error))
+            return
+        try:
+            with self._health.timed('detection'):
+                labels = self._stage.process(frame)
+        except Exception as error:  # the prior is a help, not a must: nobody waits in vain
+            self._on_error(error)
+            labels = Labels(raw.stamp_ns, np.zeros(frame.camera.shape, np.uint8))
+        self._publish(labels, raw)
+
+    def _publish(self, labels: Labels, raw: RawFrame) -> None:
+        head = conversions.header(labels.stamp_ns, raw.color.header.frame_id)
+        self._labels.publish(conversions.probability_to_message(labels.p_dynamic, head))
+        self._detections.publish(labels, head)
+        self._health.counts['labels'] += 1
+        self._health.counts['frames_dropped'] = self._worker.dropped
+
+    def _on_error(self, error: Exception) -> None:
+        self._health.counts['errors'] += 1
+        self._health.set_problem('error', f'{type(error).__name__}: {error}')
+
+    def _reset(self) -> None:
+        self._worker.clear()
+        self._worker.wait_idle(1.0)
+        self._stage.reset()
+
+    def close(self) -> None:
+        """Stop working."""
+        self._worker.stop()
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node."""
+    return run(DetectionNode, args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
