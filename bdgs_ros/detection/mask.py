@@ -96,7 +96,7 @@ def cut_box(bins: Bins, box: Box, config: CutConfig) -> Mask:
     layer, peak = _depth_layer(contrast, config)
     mask = _without_specks(layer[window])
     if _BIN_DEPTH_M[peak] < config.near:
-        return mask | holes
+        return mask | _touching(holes, mask)
     return mask | (_close(mask) & holes)
 
 
@@ -144,6 +144,15 @@ def _without_specks(mask: Mask) -> Mask:
     if count <= 1:
         return mask
     return np.asarray(keep[labels], dtype=np.uint8)
+
+
+def _touching(holes: Mask, mask: Mask) -> Mask:
+    """Return the connected holes that touch the mask."""
+    count, labels = cv2.connectedComponents(holes, connectivity=4)
+    touched = np.zeros(count, bool)
+    touched[labels[cv2.dilate(mask, np.ones((3, 3), np.uint8)) > 0]] = True
+    touched[0] = False
+    return np.asarray(touched[labels], dtype=np.uint8)
 
 
 def _close(mask: Mask) -> Mask:
