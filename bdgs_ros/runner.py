@@ -17,12 +17,12 @@ from typing import Any, Protocol
 from bdgs_ros.core.config import BdgsConfig, specs
 from bdgs_ros.core.errors import EvaluationError
 from bdgs_ros.core.types import RgbdFrame, TrackingResult, Trajectory
+from bdgs_ros.data.trajectory_io import write_trajectory
 from bdgs_ros.eval import pictures, plots, provenance, scores, trajectory
 from bdgs_ros.eval.files import write_aside, write_text
 from bdgs_ros.eval.labels import LabelScore, score_labels
 from bdgs_ros.eval.metric import Metric, as_dict, dump_json
 from bdgs_ros.eval.recorder import Recorder, RunResult
-from bdgs_ros.eval.tum_file import write_tum
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -188,13 +188,13 @@ def write_results(
 
     Raises
     ------
-    OSError
+    DatasetError, MapError, OSError
         If a file cannot be written.
 
     """
     folder.mkdir(parents=True, exist_ok=True)
     est = result.trajectory
-    write_tum(folder / 'trajectory.txt', est, 'T_world_camera of every tracked frame')
+    write_trajectory(folder / 'trajectory.txt', est)
     found = [*result.count_metrics(), *result.time_metrics()]
     expected = len(result.rows) if frames_expected is None else frames_expected
     ate, notes = _compare(ground_truth, est, expected)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bdgs_ros.core.camera import PinholeCamera
+from bdgs_ros.core.errors import EvaluationError
 from bdgs_ros.core.types import (
     DYNAMIC_THRESHOLD,
     ColorImage,
@@ -22,6 +24,7 @@ from bdgs_ros.eval import rendering, trajectory
 from bdgs_ros.eval.metric import Metric
 from bdgs_ros.eval.recorder import Sample
 
+_LOGGER = logging.getLogger(__name__)
 _SEEN = 0.5  # silhouette above which the map says something about a pixel
 
 
@@ -34,7 +37,7 @@ class Render(Protocol):
 
     @property
     def depth(self) -> NDArray[np.float32]:
-        """Shape (H, W), metres, 0 where the map is empty."""
+        """Shape (H, W), metres times accumulated opacity."""
 
     @property
     def silhouette(self) -> NDArray[np.float32]:
@@ -67,7 +70,8 @@ class View:
 
     sample: Sample
     color: NDArray[np.float32]
-    depth: NDArray[np.float32]
+    depth_m: NDArray[np.float32]
+    """Expected depth; 0 where the map is empty."""
     silhouette: NDArray[np.float32]
 
 
@@ -76,12 +80,17 @@ def render_samples(samples: Sequence[Sample], renderer: Renderer) -> list[View]:
     views = []
     for sample in samples:
         render = renderer.render(sample.T_world_camera, sample.frame.camera)
-        views.append(View(sample, render.color, render.depth, render.silhouette))
+        seen = render.silhouette > _SEEN
+        depth_m = np.where(seen, render.depth / np.maximum(render.silhouette, _SEEN), 0.0)
+        views.append(View(sample, render.color, depth_m.astype(np.float32), render.silhouette))
     return views
 
 
 def trajectory_metrics(
-    gt: Trajectory, est: Trajectory, frames_expected: int | None = None
+    gt: Trajectory,
+    est: Trajectory,
+    frames_expected: int | None = None,
+    max_difference_s: float = trajectory.MAX_DIFFERENCE_S,
 ) -> list[Metric]:
     """
     Return ATE, coverage, and RPE per frame and, where it is long enough, per second.
@@ -92,10 +101,13 @@ def trajectory_metrics(
         If the trajectories cannot be compared.
 
     """
-    metrics = trajectory.ate(gt, est, frames_expected=frames_expected).metrics()
-    metrics += trajectory.rpe_frames(gt, est).metrics('frame')
-    if est.stamps_ns[-1] - est.stamps_ns[0] > 1.1e9:
-        metrics += trajectory.rpe_seconds(gt, est).metrics('second')
+    limit_s = max_difference_s
+    metrics = trajectory.ate(gt, est, limit_s, frames_expected).metrics()
+    metrics += trajectory.rpe_frames(gt, est, 1, limit_s).metrics('frame')
+    try:
+        metrics += trajectory.rpe_seconds(gt, est, 1.0, limit_s).metrics('second')
+    except EvaluationError:
+        _LOGGER.info('shorter than a second: no drift per second')
     return metrics
 
 
@@ -163,7 +175,7 @@ def _scores(
         'psnr': rendering.psnr(view.color, color, valid),
         'psnr_exposure_fit': rendering.psnr(fitted, color, valid),
         'ssim': rendering.ssim(view.color, color, valid),
-        'depth_l1': 100.0 * rendering.depth_l1(view.depth, depth, valid),
+        'depth_l1': 100.0 * rendering.depth_l1(view.depth_m, depth, valid),
         'seen': 100.0 * float(np.mean(view.silhouette > _SEEN)),
     }
 

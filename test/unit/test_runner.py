@@ -10,8 +10,8 @@ import pytest
 from run_fakes import FakeSequence, FakeSlam, FakeTruth
 
 from bdgs_ros.core.types import StampedPose, TrackingStatus, Trajectory
+from bdgs_ros.data.trajectory_io import read_trajectory
 from bdgs_ros.eval.recorder import Recorder
-from bdgs_ros.eval.tum_file import read_tum
 from bdgs_ros.runner import LabelObserver, run_sequence, write_results
 
 
@@ -80,7 +80,7 @@ def test_results_are_complete(run, tmp_path):
     assert values['keyframes'] == 3
     assert metrics['notes'] == []
     assert json.loads((tmp_path / 'out/metrics.json').read_text())['sequence'] == 'fake'
-    assert len(read_tum(tmp_path / 'out/trajectory.txt')) == 10
+    assert len(read_trajectory(tmp_path / 'out/trajectory.txt')) == 10
     made = {p.name for p in (tmp_path / 'out').iterdir()}
     assert made == {
         'trajectory.txt',

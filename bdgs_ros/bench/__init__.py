@@ -1,0 +1,1 @@
+"""Benches: sequences x configurations x seeds, one harness for all figures."""

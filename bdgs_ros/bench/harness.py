@@ -1,0 +1,175 @@
+"""
+The harness of all benches: run cells, keep each result, write `results.json` and a table.
+
+A bench is a module with `NAME`, `PROTOCOL` (one paragraph), `cells(options)`,
+`run_cell(cell, options)` and `summarise(rows)`. Every finished cell is a file of its own, so a
+run that was interrupted goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import hashlib
+import json
+import logging
+import re
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from bdgs_ros.core.errors import BdgsError
+from bdgs_ros.eval import provenance
+from bdgs_ros.eval.files import write_text
+from bdgs_ros.eval.metric import dump_json, jsonable, markdown_table
+
+_LOGGER = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One measurement: what, how, and which random seed."""
+
+    sequence: str
+    configuration: str
+    seed: int = 0
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Everything else that decides the result; part of the cell's identity."""
+
+    @property
+    def key(self) -> str:
+        """A file name that is the same for the same measurement, readable at its start."""
+        text = json.dumps(jsonable(asdict(self)), sort_keys=True)
+        digest = hashlib.sha256(text.encode()).hexdigest()[:10]
+        label = re.sub(r'[^A-Za-z0-9.]+', '_', self.label)
+        return f'{label}-{digest}'
+
+    @property
+    def label(self) -> str:
+        """What people and `--only` call the cell."""
+        return f'{self.sequence}/{self.configuration}/{self.seed}'
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the command line says to every bench."""
+
+    work: Path
+    """Where cells, recordings and results are kept."""
+    data: Path
+    """The folder that holds `data/` and `models/`."""
+    quick: bool = False
+    seeds: tuple[int, ...] = (0,)
+    weights: Path | None = None
+    values: Mapping[str, Any] = field(default_factory=dict)
+    """Parameters that differ from the defaults, for every configuration."""
+
+
+class Bench(Protocol):
+    """What a bench module offers."""
+
+    NAME: str
+    PROTOCOL: str
+
+    def cells(self, options: Options) -> list[Cell]:
+        """List what is to be measured."""
+
+    def run_cell(self, cell: Cell, options: Options) -> dict[str, Any]:
+        """Measure one cell; returns the columns of its row."""
+
+    def summarise(self, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        """Boil the rows that succeeded down to a few figures."""
+
+
+def run_bench(
+    bench: Bench, options: Options, only: Sequence[str] = (), force: bool = False
+) -> dict[str, Any]:
+    """
+    Measure every cell that has no result yet, and write all results.
+
+    Parameters
+    ----------
+    bench : module
+        See the top of this file.
+    options : Options
+        Where and how.
+    only : sequence of str
+        Patterns such as `crowd*` or `*/geometric/*`; a cell whose label, sequence or
+        configuration matches one is measured. All by default.
+    force : bool
+        Measure again what has a result.
+
+    Returns
+    -------
+    results : dict
+        `summary`, `rows`, `protocol` and provenance, as in `results.json`. A cell that failed is
+        a row with `error`; it is tried again next time.
+
+    """
+    from tqdm import tqdm
+
+    chosen = [cell for cell in bench.cells(options) if _matches(cell, only)]
+    rows = []
+    with tqdm(chosen, desc=bench.NAME, unit='cell', file=sys.stderr, leave=False) as bar:
+        for cell in bar:
+            bar.set_postfix_str(cell.label)
+            rows.append(_cell_row(bench, cell, options, force))
+    results = _document(bench, options, rows)
+    write_text(options.work / 'results.json', dump_json(results) + '\n')
+    write_text(options.work / 'results.md', to_markdown(results))
+    return results
+
+
+def _matches(cell: Cell, only: Sequence[str]) -> bool:
+    names = (cell.label, cell.sequence, cell.configuration)
+    return not only or any(fnmatch.fnmatch(name, p) for p in only for name in names)
+
+
+def _cell_row(bench: Bench, cell: Cell, options: Options, force: bool) -> dict[str, Any]:
+    path = options.work / 'cells' / f'{cell.key}.json'
+    if path.is_file() and not force:
+        row: dict[str, Any] = json.loads(path.read_text(encoding='utf-8'))
+        return row
+    row = {'sequence': cell.sequence, 'configuration': cell.configuration, 'seed': cell.seed}
+    start = time.perf_counter()
+    try:
+        row.update(bench.run_cell(cell, options))
+    except BdgsError as error:
+        _LOGGER.warning('%s failed: %s', cell.label, error)
+        return {**row, 'error': str(error)}
+    row.update(wall_s=time.perf_counter() - start, commit=provenance.commit())
+    row = jsonable(row)
+    write_text(path, dump_json(row) + '\n')
+    return row
+
+
+def _document(bench: Bench, options: Options, rows: list[dict[str, Any]]) -> dict[str, Any]:
+    good = [row for row in rows if 'error' not in row]
+    return {
+        'bench': bench.NAME,
+        'summary': bench.summarise(good) if good else {},
+        'rows': rows,
+        'failed': len(rows) - len(good),
+        'protocol': ' '.join(bench.PROTOCOL.split()),
+        'quick': options.quick,
+        'parameters': dict(options.values),
+        'commits': sorted({row['commit'] for row in good}),
+        'provenance': provenance.provenance(),
+    }
+
+
+def to_markdown(results: Mapping[str, Any]) -> str:
+    """Write results as a page: how they were made, the rows, the summary."""
+    machine = results['provenance']['machine']
+    hidden = ('commit', 'wall_s')
+    rows = [{k: v for k, v in row.items() if k not in hidden} for row in results['rows']]
+    summary = [{'figure': k, 'value': v} for k, v in results['summary'].items()]
+    quick = ' Quick: shortened, not for comparison.' if results['quick'] else ''
+    return (
+        f'# bdgs bench {results["bench"]}\n\n{results["protocol"]}{quick}\n\n'
+        f'Commit {", ".join(results["commits"]) or "-"}; {machine["processor"]}, '
+        f'{machine["cores"]} cores; Python {machine["python"]}.\n\n'
+        f'{markdown_table(rows)}\n{markdown_table(summary)}'
+    )

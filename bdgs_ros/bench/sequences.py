@@ -1,0 +1,60 @@
+"""The recordings that benches run: real ones by folder, synthetic ones made on demand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from bdgs_ros.core.errors import DatasetError
+
+SYNTH_FRAMES = 300
+SYNTH_FRAMES_QUICK = 60
+
+
+@dataclass(frozen=True)
+class RealSequence:
+    """A recording under `data/` of the data folder."""
+
+    name: str
+    folder: str
+    source: str
+
+
+REAL = (
+    RealSequence(
+        'bonn_crowd_part', 'rgbd_bonn_crowd_part', 'BONN RGB-D Dynamic, crowd, first 520 frames'
+    ),
+    RealSequence(
+        'fr1_rpy_part', 'rgbd_dataset_freiburg1_rpy_part', 'TUM fr1/rpy, first 240 frames'
+    ),
+)
+
+
+def real_path(name: str, data: Path) -> Path:
+    """
+    Return the folder of a real recording.
+
+    Raises
+    ------
+    DatasetError
+        If the folder is not there.
+
+    """
+    folder = {sequence.name: sequence.folder for sequence in REAL}[name]
+    path = data / 'data' / folder
+    if not path.is_dir():
+        raise DatasetError(
+            f"recording '{name}' was expected at '{path}'; say where the recordings are with "
+            '--data or BDGS_SHARED'
+        )
+    return path
+
+
+def synth_path(scenario: str, seed: int, frames: int, work: Path) -> Path:
+    """Return the folder of a synthetic recording, made now if it is not there yet."""
+    path = work / 'synth' / f'{scenario}_{seed}_{frames}'
+    if not path.is_dir():
+        from bdgs_ros.data.synth import write_recording
+
+        write_recording(path, scenario, seed=seed, frames=frames)
+    return path

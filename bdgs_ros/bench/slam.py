@@ -1,0 +1,132 @@
+"""Bench `slam`: accuracy of pose, labels and render on real and synthetic recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bdgs_ros.bench.harness import Cell, Options
+from bdgs_ros.bench.sequences import (
+    REAL,
+    SYNTH_FRAMES,
+    SYNTH_FRAMES_QUICK,
+    real_path,
+    synth_path,
+)
+from bdgs_ros.core.config import BdgsConfig, with_values
+from bdgs_ros.core.errors import ModelError
+
+NAME = 'slam'
+PROTOCOL = """
+Every colour frame with depth goes through the pipeline in order, none dropped. ATE: RMSE in cm
+over all estimated frames, nearest ground truth within 20 ms, rigid Horn alignment without scale;
+coverage: frames with a pose over frames. precision and recall: dynamic pixels pooled over all
+frames, against exact masks (synthetic only). psnr: the final static map at the estimated poses of
+up to 40 evenly spaced frames that were no keyframes; synthetic: against the true image of the
+static world, all pixels; real: against the input, pixels called dynamic left out. psnr_hidden:
+only the pixels that something moving covered. ms: medians, `mapping` per keyframe.
+"""
+
+WEIGHTS = Path('models') / 'yolov5n-320.onnx'
+_QUICK_SCENARIOS = ('static', 'walking_static')
+_QUICK_FRAMES = 60
+
+_COLUMNS = {
+    'frames': 'frames_in',
+    'coverage_percent': 'coverage',
+    'ate_rmse_cm': 'ate_rmse',
+    'ate_max_cm': 'ate_max',
+    'precision': 'dynamic_precision',
+    'recall': 'dynamic_recall',
+    'false_positive_rate': 'dynamic_false_positive_rate',
+    'psnr_db': 'psnr',
+    'psnr_exposure_fit_db': 'psnr_exposure_fit',
+    'psnr_hidden_db': 'psnr_hidden',
+    'ssim': 'ssim',
+    'gaussians': 'gaussians',
+    'map_mb': 'map_size',
+    'detection_ms': 'detection_median',
+    'tracking_ms': 'tracking_median',
+    'mapping_ms': 'mapping_median',
+    'keyframes': 'keyframes',
+}
+
+
+def weights_path(options: Options) -> Path:
+    """Return where the detector's weights are looked for."""
+    return options.weights or options.data / WEIGHTS
+
+
+def cells(options: Options) -> list[Cell]:
+    """List real and synthetic recordings, each with weights and with the geometric prior alone."""
+    from bdgs_ros.data.synth import scenarios
+
+    names = _QUICK_SCENARIOS if options.quick else tuple(scenarios())
+    real_frames = _QUICK_FRAMES if options.quick else None
+    synth_frames = SYNTH_FRAMES_QUICK if options.quick else SYNTH_FRAMES
+    common = {'values': dict(options.values)}
+    found = []
+    for configuration in ('weights', 'geometric'):
+        for sequence in REAL:
+            settings = {'kind': 'real', 'frames': real_frames, **common}
+            found.append(Cell(sequence.name, configuration, 0, settings))
+        for name in names:
+            settings = {'kind': 'synth', 'frames': synth_frames, **common}
+            found += [Cell(f'synth_{name}', configuration, s, settings) for s in options.seeds]
+    return sorted(found, key=lambda cell: (cell.settings['kind'], cell.sequence, cell.seed))
+
+
+def run_cell(cell: Cell, options: Options) -> dict[str, Any]:
+    """Run one recording with one configuration; its result files stay in the work folder."""
+    from bdgs_ros.job import Job, run_job
+
+    synthetic = cell.settings['kind'] == 'synth'
+    frames = cell.settings['frames']
+    config = _config(cell, options)
+    if synthetic:
+        scenario = cell.sequence.removeprefix('synth_')
+        recording = synth_path(scenario, cell.seed, frames, options.work.parent)
+    else:
+        recording = real_path(cell.sequence, options.data)
+    output = options.work / 'runs' / cell.key
+    limit = None if synthetic else frames
+    metrics = run_job(Job(recording, output, config, frames=limit))['metrics']
+    return {column: metrics[name]['value'] for column, name in _COLUMNS.items() if name in metrics}
+
+
+def _config(cell: Cell, options: Options) -> BdgsConfig:
+    values = dict(options.values)
+    if cell.configuration == 'weights':
+        path = weights_path(options)
+        if not path.is_file():
+            raise ModelError(f"no weights at '{path}'; give them with --weights")
+        values['detection.weights'] = str(path)
+    return with_values(BdgsConfig(), values)
+
+
+def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return ATE of each real recording, and medians and worst over the synthetic ones."""
+    summary: dict[str, Any] = {}
+    for configuration in dict.fromkeys(row['configuration'] for row in rows):
+        own = [row for row in rows if row['configuration'] == configuration]
+        for sequence in REAL:
+            summary[f'{sequence.name}_ate_cm_{configuration}'] = _pick(own, sequence.name)
+        synth = [row for row in own if row['sequence'].startswith('synth_')]
+        for column in ('ate_rmse_cm', 'precision', 'recall', 'psnr_db'):
+            values = [row[column] for row in synth if row.get(column) is not None]
+            if values:
+                summary[f'synth_{column}_median_{configuration}'] = float(np.median(values))
+        errors = [row['ate_rmse_cm'] for row in synth if row.get('ate_rmse_cm') is not None]
+        if errors:
+            summary[f'synth_ate_rmse_cm_worst_{configuration}'] = max(errors)
+    covered = [row.get('coverage_percent') for row in rows]
+    known = [value for value in covered if value is not None]
+    summary['coverage_percent_min'] = min(known) if known else None
+    return {name: value for name, value in summary.items() if value is not None}
+
+
+def _pick(rows: Sequence[Mapping[str, Any]], sequence: str) -> float | None:
+    return next((row.get('ate_rmse_cm') for row in rows if row['sequence'] == sequence), None)

@@ -1,0 +1,60 @@
+"""`bdgs run`: a recording through the pipeline, without ROS."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+from bdgs_ros.cli.config import add_config_arguments, load_config, with_weights
+from bdgs_ros.eval.metric import dump_json, markdown_table
+
+NAME = 'run'
+HELP = 'run a recording (folder or bag) without ROS; write trajectory, map, metrics, pictures'
+
+_SHOWN = (
+    'frames_in', 'frames_lost', 'coverage', 'keyframes', 'ate_rmse', 'ate_mean', 'ate_std',
+    'ate_max', 'rpe_translation_second_rmse', 'dynamic_precision', 'dynamic_recall',
+    'dynamic_false_positive_rate', 'psnr', 'psnr_exposure_fit', 'psnr_hidden', 'ssim', 'depth_l1',
+    'gaussians', 'map_size', 'detection_median', 'tracking_median', 'tracking_p95',
+    'mapping_median', 'mapping_p95', 'frame_median',
+)  # fmt: skip
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument('recording', type=Path, help='folder in TUM, BONN, ... layout, or a bag')
+    parser.add_argument('--output', type=Path, required=True, metavar='DIR', help='results')
+    parser.add_argument('--weights', type=Path, metavar='ONNX', help='weights of the detector')
+    parser.add_argument('--camera', type=Path, metavar='FILE', help='camera.yaml of the recording')
+    parser.add_argument('--start', type=int, default=0, metavar='N', help='first frame')
+    parser.add_argument('--frames', type=int, metavar='N', help='number of frames')
+    parser.add_argument('--no-pictures', action='store_true', help='leave the pictures out')
+    parser.add_argument('--json', action='store_true', help='print the metrics for machines')
+    add_config_arguments(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the recording and print the figures."""
+    from bdgs_ros.job import Job, run_job
+
+    job = Job(
+        recording=arguments.recording,
+        output=arguments.output,
+        config=with_weights(load_config(arguments), arguments.weights),
+        camera_file=arguments.camera,
+        start=arguments.start,
+        frames=arguments.frames,
+        pictures=not arguments.no_pictures,
+    )
+    metrics = run_job(job)
+    sys.stdout.write(dump_json(metrics) + '\n' if arguments.json else _summary(metrics))
+    return 0
+
+
+def _summary(metrics: dict[str, Any]) -> str:
+    found = metrics['metrics']
+    rows = [{'metric': name, **found[name]} for name in _SHOWN if name in found]
+    notes = ''.join(f'note: {note}\n' for note in metrics['notes'])
+    return markdown_table(rows) + notes

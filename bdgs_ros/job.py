@@ -1,0 +1,111 @@
+"""One whole run: open a recording, run it, score it, write the results."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from bdgs_ros.core.config import BdgsConfig
+from bdgs_ros.core.errors import DatasetError
+from bdgs_ros.core.types import RgbdFrame
+from bdgs_ros.data.sequence import Sequence
+from bdgs_ros.runner import LabelObserver, run_sequence, write_results
+
+
+@dataclass(frozen=True)
+class Job:
+    """What to run and where to leave the results."""
+
+    recording: Path
+    output: Path
+    config: BdgsConfig = field(default_factory=BdgsConfig)
+    camera_file: Path | None = None
+    start: int = 0
+    frames: int | None = None
+    pictures: bool = True
+    progress: bool = True
+
+
+def run_job(job: Job) -> dict[str, Any]:
+    """
+    Run a recording and write its results.
+
+    Returns
+    -------
+    metrics : dict
+        What `metrics.json` holds.
+
+    Raises
+    ------
+    BdgsError
+        If the recording, the weights or the results cannot be read or written.
+
+    """
+    from bdgs_ros.pipeline import BdgsSlam
+
+    sequence = _open(job)
+    chosen = choose_frames(len(sequence), job.start, job.frames)
+    truth = open_truth(job.recording)
+    labels = None if truth is None else LabelObserver(truth)
+    slam = BdgsSlam(job.config)
+    start = time.perf_counter()
+    result = run_sequence(
+        _with_progress(sequence, chosen, job.progress), slam, [] if labels is None else [labels]
+    )
+    wall_s = time.perf_counter() - start
+    return write_results(
+        job.output,
+        result,
+        slam.mapper,
+        name=sequence.name,
+        ground_truth=sequence.ground_truth,
+        truth=truth,
+        labels=None if labels is None else labels.score,
+        config=job.config,
+        extra={'frames': [chosen.start, chosen.stop], 'wall_s': wall_s},
+        with_pictures=job.pictures,
+    )
+
+
+def _open(job: Job) -> Sequence:
+    from bdgs_ros.data.layouts import open_sequence
+
+    return open_sequence(job.recording, job.camera_file)
+
+
+def choose_frames(available: int, start: int, count: int | None) -> range:
+    """Return the frames to run; `DatasetError` if the recording does not have them."""
+    stop = available if count is None else start + count
+    if not 0 <= start < stop <= available:
+        raise DatasetError(
+            f'frames {start} to {stop} were asked for, but the recording has {available}'
+        )
+    return range(start, stop)
+
+
+def open_truth(recording: Path) -> Any:
+    """Return the truth of a synthetic recording, or None for any other."""
+    if not (recording / 'truth').is_dir():
+        return None
+    from bdgs_ros.data.synth.truth import SynthTruth
+
+    return SynthTruth(recording)
+
+
+def _with_progress(sequence: Sequence, chosen: range, show: bool) -> Iterator[RgbdFrame]:
+    from tqdm import tqdm
+
+    bar = tqdm(
+        chosen, desc=sequence.name, unit='frame', file=sys.stderr, disable=not show, leave=False
+    )
+    if len(chosen) == len(sequence):
+        frames = iter(sequence)  # one pass, which bags read much faster than frame by frame
+        for _ in bar:
+            yield next(frames)
+    else:
+        for index in bar:
+            yield sequence[index]
