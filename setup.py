@@ -21,11 +21,16 @@ ROOT = os.path.relpath(os.path.dirname(os.path.realpath(__file__)))
 
 # One source, three builds; bdgs_ros.mapping.rasterize picks the best the processor can run.
 RASTERIZER_FLAGS = {
-    'avx512': ['-mavx512f', '-mavx512dq', '-mavx512vl', '-mavx512bw', '-mfma', '-mavx2'],
+    'avx512': [
+        *('-mavx512f', '-mavx512dq', '-mavx512vl', '-mavx512bw', '-mfma', '-mavx2'),
+        '-mprefer-vector-width=512',
+    ],
     'avx2': ['-mavx2', '-mfma'],
     'base': [],
 }
 COMPILE = ['-O3', '-std=c++17', '-fopenmp', '-fvisibility=hidden', '-fno-math-errno']
+# NaN keeps its meaning: nothing of -ffast-math that would assume it away
+RASTERIZER_COMPILE = [*COMPILE, '-fno-trapping-math', '-ffp-contract=fast', '-Wno-psabi']
 
 
 def native_extensions():
@@ -41,7 +46,8 @@ def native_extensions():
             [os.path.join(ROOT, 'src', 'rasterizer.cpp')],
             include_dirs=include,
             define_macros=[('BDGS_MODULE', f'_rasterizer_{name}')],
-            extra_compile_args=COMPILE + flags,
+            depends=sorted(glob(os.path.join(ROOT, 'src', 'rasterizer*.hpp'))),
+            extra_compile_args=RASTERIZER_COMPILE + flags,
             extra_link_args=['-fopenmp'],
             language='c++',
             optional=True,

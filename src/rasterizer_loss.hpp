@@ -1,0 +1,286 @@
+// The loss of one view and its gradient with respect to the rendered planes.
+//
+//   I   = exp(log_gain) C + offset                        exposure of the target, C rendered
+//   E   = sum_p w_p [ l1 |I - T|_p + ssim (1 - SSIM_p) ] / sum_p w_p
+//       + depth  sum_{p: D_p > 0} w_p |Z - S D|_p / sum_{p: D_p > 0} w_p
+//
+// |.| and SSIM are means over the three channels. Z = sum of weights times depth and S = silhouette,
+// so Z - S D = sum of weights times (z - D): it needs no division by S, is zero where nothing was
+// drawn, and pulls each Gaussian by its own weight. (Z / S - D instead grows without bound at the
+// rim of the map, where S goes to 0.)
+//
+// SSIM uses the usual 11 x 11 window, sigma 1.5 px, and constants for images in [0, 1]. The window
+// is cut to the pixels with w > 0 inside the image and normalised over them, so what a moving
+// object hides is in nobody's statistics. With n, mx, my, s, c the windowed sums of 1, x, y,
+// x^2 + y^2 and x y over those pixels, SSIM is a function f(mx/n, s/n, c/n), and the gradient with
+// respect to x is three more windows: blur(f_m/n) + 2 x blur(f_s/n) + y blur(f_c/n).
+
+#pragma once
+
+#include <algorithm>
+
+#include "rasterizer_simd.hpp"
+
+namespace bdgs {
+
+// All planes share one layout with a border of zeros: SSIM windows and vectors may overhang.
+struct Layout {
+  static constexpr int kBorder = 16;
+  int width = 0, height = 0;
+  size_t stride = 0, plane = 0;
+
+  Layout() = default;
+  Layout(int w, int h) : width(w), height(h) {
+    stride = (w + 15) / 16 * 16 + 2 * kBorder;
+    if (stride % 256 == 0) stride += 16;  // rows 1 KiB apart fall into the same cache sets
+    plane = stride * ((h + 15) / 16 * 16 + 2 * kBorder) + 16;
+  }
+  size_t at(int y, int x) const { return (y + kBorder) * stride + kBorder + x; }
+};
+
+enum Plane {
+  kRed, kGreen, kBlue, kDepth, kSilhouette, kDynamic,  // rendered
+  kGradRed, kGradGreen, kGradBlue, kGradDepth, kGradSilhouette,
+  kWeight, kMask,           // w and w > 0
+  kX, kY = kX + 3, kS = kY + 3, kC = kS + 3,
+  kField = kC + 3,          // f_m/n, f_s/n, f_c/n of three channels
+  kPlanes = kField + 9
+};
+
+struct LossInput {
+  const float *color, *depth, *weight;  // target: [H, W, 3], [H, W], [H, W]
+  float l1, ssim, depth_weight, log_gain, offset;
+};
+
+struct LossResult {
+  double total = 0, l1 = 0, ssim = 0, depth = 0, d_log_gain = 0, d_offset = 0;
+};
+
+class Loss {
+ public:
+  // Fill the gradient planes from the rendered planes and the target. Sums are made per row and
+  // then in order of rows, so the result does not depend on the number of threads.
+  LossResult compute(const Layout& layout, float* planes, const LossInput& in, int threads) {
+    layout_ = layout;
+    planes_ = planes;
+    in_ = in;
+    gain_ = std::exp(in.log_gain);
+    rows_.reserve(layout.height);
+    fill_window();
+    const int height = layout.height;
+#pragma omp parallel num_threads(threads)
+    {
+#pragma omp for schedule(static)
+      for (int y = 0; y < height; ++y) count_row(y);
+#pragma omp single
+      set_scales();
+#pragma omp for schedule(static)
+      for (int y = 0; y < height; ++y) pixel_row(y);
+      if (in_.ssim > 0) {
+#pragma omp for schedule(static)
+        for (int y = 0; y < height; ++y) ssim_row(y);
+      }
+#pragma omp for schedule(static)
+      for (int y = 0; y < height; ++y) finish_row(y);
+    }
+    return total();
+  }
+
+ private:
+  static constexpr int kRadius = 5;
+  static constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;
+
+  struct Row {
+    double weight, depth_weight, l1, ssim, depth, d_log_gain, d_offset;
+  };
+
+  float* plane(int which, int y) { return planes_ + which * layout_.plane + layout_.at(y, 0); }
+
+  void fill_window() {
+    double sum = 0;
+    for (int d = -kRadius; d <= kRadius; ++d) sum += std::exp(-d * d / 4.5);
+    for (int d = 0; d <= kRadius; ++d)
+      window_[d] = static_cast<float>(std::exp(-d * d / 4.5) / sum);
+  }
+
+  static bool usable(float depth) { return depth > 0.0f && depth < 1e30f; }
+
+  void count_row(int y) {
+    Row& row = rows_[y] = Row{};
+    const float* weight = in_.weight + static_cast<size_t>(y) * layout_.width;
+    const float* depth = in_.depth + static_cast<size_t>(y) * layout_.width;
+    float sum = 0, sum_depth = 0;
+    for (int x = 0; x < layout_.width; ++x) {
+      const float w = weight[x] > 0.0f ? weight[x] : 0.0f;
+      sum += w;
+      sum_depth += usable(depth[x]) ? w : 0.0f;
+    }
+    row.weight = sum;
+    row.depth_weight = sum_depth;
+  }
+
+  void set_scales() {
+    double weight = 0, depth_weight = 0;
+    for (int y = 0; y < layout_.height; ++y) {
+      weight += rows_[y].weight;
+      depth_weight += rows_[y].depth_weight;
+    }
+    per_weight_ = weight > 0 ? static_cast<float>(1.0 / weight) : 0.0f;
+    per_depth_ = depth_weight > 0 ? static_cast<float>(1.0 / depth_weight) : 0.0f;
+  }
+
+  // L1 and depth terms, and the planes that SSIM windows run over.
+  void pixel_row(int y) {
+    const int width = layout_.width;
+    const float* weight = in_.weight + static_cast<size_t>(y) * width;
+    const float* depth = in_.depth + static_cast<size_t>(y) * width;
+    const float* target = in_.color + static_cast<size_t>(y) * width * 3;
+    float *w = plane(kWeight, y), *m = plane(kMask, y);
+    for (int x = 0; x < width; ++x) {
+      w[x] = weight[x] > 0.0f ? weight[x] : 0.0f;
+      m[x] = weight[x] > 0.0f ? 1.0f : 0.0f;
+    }
+    float l1 = 0;
+    const float l1_scale = in_.l1 * per_weight_ / 3.0f;
+    for (int c = 0; c < 3; ++c) {
+      const float* rendered = plane(kRed + c, y);
+      float *px = plane(kX + c, y), *py = plane(kY + c, y), *grad = plane(kGradRed + c, y);
+      float *ps = plane(kS + c, y), *pc = plane(kC + c, y);
+      for (int i = 0; i < width; ++i) {
+        const float t = m[i] > 0.0f ? target[3 * i + c] : 0.0f;
+        const float v = m[i] > 0.0f ? gain_ * rendered[i] + in_.offset : 0.0f;
+        const float error = v - t;
+        px[i] = v;
+        py[i] = t;
+        ps[i] = v * v + t * t;
+        pc[i] = v * t;
+        const float sign = error > 0.0f ? 1.0f : (error < 0.0f ? -1.0f : 0.0f);
+        grad[i] = l1_scale * w[i] * sign;
+      }
+      Lanes sum_error = Lanes{};  // the overhang is zero in both planes
+      for (int i = 0; i < width; i += kLanes)
+        sum_error += load(w + i) * abs(load(px + i) - load(py + i));
+      l1 += sum(sum_error);
+    }
+    rows_[y].l1 = l1 / 3.0;
+    depth_row(y, depth, w);
+  }
+
+  void depth_row(int y, const float* depth, const float* w) {
+    const float *z = plane(kDepth, y), *s = plane(kSilhouette, y);
+    float *grad_z = plane(kGradDepth, y), *grad_s = plane(kGradSilhouette, y);
+    const float scale = in_.depth_weight * per_depth_;
+    float loss = 0;
+    for (int x = 0; x < layout_.width; ++x) {
+      const float d = usable(depth[x]) ? depth[x] : 0.0f;
+      const float use = usable(depth[x]) ? w[x] : 0.0f;
+      const float error = z[x] - s[x] * d;
+      const float sign = error > 0.0f ? 1.0f : (error < 0.0f ? -1.0f : 0.0f);
+      loss += use * std::fabs(error);
+      grad_z[x] = scale * use * sign;
+      grad_s[x] = -grad_z[x] * d;
+    }
+    rows_[y].depth = loss;
+  }
+
+  // Vertical half of the window for row y; `out` also covers the border that the other half needs.
+  void blur_columns(const float* in, float* out) const {
+    const ptrdiff_t stride = static_cast<ptrdiff_t>(layout_.stride);
+    for (int x = -Layout::kBorder; x < layout_.width + kRadius; x += kLanes) {
+      Lanes sum = window_[0] * load(in + x);
+      for (int d = 1; d <= kRadius; ++d)
+        sum += window_[d] * (load(in + x - d * stride) + load(in + x + d * stride));
+      store(out + Layout::kBorder + x, sum);
+    }
+  }
+
+  Lanes blur_row(const float* columns, int x) const {
+    const float* at = columns + Layout::kBorder + x;
+    Lanes sum = window_[0] * load(at);
+    for (int d = 1; d <= kRadius; ++d) sum += window_[d] * (load(at - d) + load(at + d));
+    return sum;
+  }
+
+  void ssim_row(int y) {
+    static thread_local Buffer<float> memory;
+    const size_t length = layout_.stride + 2 * kLanes;
+    float* columns = memory.reserve(13 * length);
+    blur_columns(plane(kMask, y), columns);
+    for (int k = 0; k < 12; ++k) blur_columns(plane(kX + k, y), columns + (1 + k) * length);
+    const float* weight = plane(kWeight, y);
+    const float scale = in_.ssim * per_weight_ / 3.0f;
+    Lanes loss = Lanes{};
+    for (int x = 0; x < layout_.width; x += kLanes) {
+      const Lanes w = load(weight + x);
+      const Lanes per_n = 1.0f / max(blur_row(columns, x), splat(1e-6f));
+      for (int c = 0; c < 3; ++c) {
+        const Lanes mx = per_n * blur_row(columns + (1 + c) * length, x);
+        const Lanes my = per_n * blur_row(columns + (4 + c) * length, x);
+        const Lanes ss = per_n * blur_row(columns + (7 + c) * length, x);
+        const Lanes cc = per_n * blur_row(columns + (10 + c) * length, x);
+        const Lanes a1 = 2.0f * mx * my + kC1, a2 = 2.0f * (cc - mx * my) + kC2;
+        const Lanes mm = mx * mx + my * my;
+        const Lanes b1 = mm + kC1, b2 = max(ss - mm, Lanes{}) + kC2;
+        const Lanes per_b1 = 1.0f / b1, per_b2 = 1.0f / b2, per_b = per_b1 * per_b2;
+        const Lanes f = a1 * a2 * per_b;
+        const Lanes g = -scale * w * per_n;
+        const Lanes f_m = 2.0f * (my * (a2 - a1) * per_b + mx * f * (per_b2 - per_b1));
+        store(plane(kField + c, y) + x, g * f_m);
+        store(plane(kField + 3 + c, y) + x, -g * f * per_b2);
+        store(plane(kField + 6 + c, y) + x, 2.0f * g * a1 * per_b);
+        loss += w * (1.0f - f);
+      }
+    }
+    rows_[y].ssim = sum(loss) / 3.0;
+  }
+
+  // Add the gradient of SSIM, and go through the exposure.
+  void finish_row(int y) {
+    static thread_local Buffer<float> memory;
+    const size_t length = layout_.stride + 2 * kLanes;
+    float* columns = memory.reserve(9 * length);
+    const bool ssim = in_.ssim > 0;
+    for (int k = 0; ssim && k < 9; ++k) blur_columns(plane(kField + k, y), columns + k * length);
+    const float* mask = plane(kMask, y);
+    Lanes d_offset = Lanes{}, d_log_gain = Lanes{};
+    for (int c = 0; c < 3; ++c) {
+      const float *px = plane(kX + c, y), *py = plane(kY + c, y);
+      float* grad = plane(kGradRed + c, y);
+      for (int i = 0; i < layout_.width; i += kLanes) {
+        const Lanes x = load(px + i);
+        Lanes g = load(grad + i);
+        if (ssim)
+          g += load(mask + i) * (blur_row(columns + c * length, i) +
+                                 2.0f * x * blur_row(columns + (3 + c) * length, i) +
+                                 load(py + i) * blur_row(columns + (6 + c) * length, i));
+        d_offset += g;
+        d_log_gain += g * (x - in_.offset);
+        store(grad + i, g * gain_);
+      }
+    }
+    rows_[y].d_offset = sum(d_offset);
+    rows_[y].d_log_gain = sum(d_log_gain);
+  }
+
+  LossResult total() const {
+    LossResult out;
+    for (int y = 0; y < layout_.height; ++y) {
+      out.l1 += rows_[y].l1 * per_weight_;
+      out.ssim += rows_[y].ssim * per_weight_;
+      out.depth += rows_[y].depth * per_depth_;
+      out.d_log_gain += rows_[y].d_log_gain;
+      out.d_offset += rows_[y].d_offset;
+    }
+    out.total = in_.l1 * out.l1 + in_.ssim * out.ssim + in_.depth_weight * out.depth;
+    return out;
+  }
+
+  Layout layout_;
+  float* planes_ = nullptr;
+  LossInput in_{};
+  float gain_ = 1, per_weight_ = 0, per_depth_ = 0;
+  float window_[kRadius + 1] = {};
+  Buffer<Row> rows_;
+};
+
+}  // namespace bdgs

@@ -1,0 +1,154 @@
+// Vectors of kLanes floats, and the few functions the rasteriser needs of them.
+//
+// GCC's and Clang's vector extensions let one source serve every instruction set: operators work
+// lane by lane, comparisons give a Mask (all bits set where true), and `mask ? a : b` selects.
+
+#pragma once
+
+#include <cmath>
+#include <cstdint>
+#include <cstdlib>
+#include <cstring>
+#include <new>
+#include <utility>
+
+#if defined(__AVX2__)
+#include <immintrin.h>
+#endif
+
+namespace bdgs {
+
+#if defined(__AVX512F__)
+constexpr int kLanes = 16;
+typedef float Lanes __attribute__((vector_size(64)));
+typedef int32_t Mask __attribute__((vector_size(64)));
+#else
+constexpr int kLanes = 8;
+typedef float Lanes __attribute__((vector_size(32)));
+typedef int32_t Mask __attribute__((vector_size(32)));
+#endif
+
+inline Lanes splat(float value) { return value - Lanes{}; }
+
+inline Lanes load(const float* from) {
+  Lanes v;
+  std::memcpy(&v, from, sizeof(v));
+  return v;
+}
+
+inline void store(float* to, Lanes v) { std::memcpy(to, &v, sizeof(v)); }
+
+inline Mask bits_of(Lanes v) { return reinterpret_cast<Mask>(v); }
+inline Lanes from_bits(Mask v) { return reinterpret_cast<Lanes>(v); }
+
+// NaN in either argument gives b, so a NaN never survives `min(v, limit)`.
+inline Lanes min(Lanes a, Lanes b) { return a < b ? a : b; }
+inline Lanes max(Lanes a, Lanes b) { return a > b ? a : b; }
+inline Lanes abs(Lanes v) { return from_bits(bits_of(v) & 0x7fffffff); }
+
+inline bool any(Mask mask) {
+#if defined(__AVX512DQ__)
+  return _mm512_movepi32_mask(reinterpret_cast<__m512i>(mask)) != 0;
+#elif defined(__AVX2__)
+  return _mm256_movemask_ps(reinterpret_cast<__m256>(mask)) != 0;
+#else
+  int32_t joined = 0;
+  for (int i = 0; i < kLanes; ++i) joined |= mask[i];
+  return joined != 0;
+#endif
+}
+
+inline Lanes sqrt(Lanes v) {
+#if defined(__AVX512F__)
+  return reinterpret_cast<Lanes>(_mm512_sqrt_ps(reinterpret_cast<__m512>(v)));
+#elif defined(__AVX2__)
+  return reinterpret_cast<Lanes>(_mm256_sqrt_ps(reinterpret_cast<__m256>(v)));
+#else
+  for (int i = 0; i < kLanes; ++i) v[i] = std::sqrt(v[i]);
+  return v;
+#endif
+}
+
+// 1 / v to the last bit or two, without the division unit where there is an estimate.
+inline Lanes reciprocal(Lanes v) {
+#if defined(__AVX512F__)
+  const Lanes r = reinterpret_cast<Lanes>(_mm512_rcp14_ps(reinterpret_cast<__m512>(v)));
+  return r * (2.0f - v * r);
+#elif defined(__AVX2__)
+  Lanes r = reinterpret_cast<Lanes>(_mm256_rcp_ps(reinterpret_cast<__m256>(v)));
+  return r * (2.0f - v * r);
+#else
+  return 1.0f / v;
+#endif
+}
+
+// 2^v for v in [-126, 126]; relative error 2e-7 (fitted polynomial of degree 5).
+inline Lanes exp2(Lanes v) {
+  const float round = 12582912.0f;  // 1.5 * 2^23: adding it leaves the integer in the low bits
+  const Lanes shifted = v + round;
+  const Lanes f = v - (shifted - round);
+  Lanes p = f * 0.00132765f + 0.00967554f;
+  p = p * f + 0.05550713f;
+  p = p * f + 0.2402212f;
+  p = p * f + 0.69314697f;
+  p = p * f + 1.00000007f;
+  return from_bits(bits_of(p) + (bits_of(shifted) << 23));
+}
+
+// log2(v) for normal v > 0; absolute error 1e-7 (series of atanh around 1).
+inline Lanes log2(Lanes v) {
+  const Mask exponent = (bits_of(v) - 0x3f3504f3) >> 23;
+  const Lanes mantissa = from_bits(bits_of(v) - (exponent << 23));
+  const Lanes s = (mantissa - 1.0f) / (mantissa + 1.0f);
+  const Lanes z = s * s;
+  const Lanes series = ((z * 0.4121986f + 0.5770780f) * z + 0.9617967f) * z + 2.8853901f;
+  return __builtin_convertvector(exponent, Lanes) + s * series;
+}
+
+inline float sum(Lanes v) {
+  float total = 0.0f;
+  for (int i = 0; i < kLanes; ++i) total += v[i];
+  return total;
+}
+
+inline float largest(Lanes v) {
+  float best = v[0];
+  for (int i = 1; i < kLanes; ++i) best = v[i] > best ? v[i] : best;
+  return best;
+}
+
+// An array that keeps its memory between calls and starts on a cache line.
+template <typename T>
+class Buffer {
+ public:
+  Buffer() = default;
+  Buffer(const Buffer&) = delete;
+  Buffer& operator=(const Buffer&) = delete;
+  Buffer(Buffer&& other) noexcept { std::swap(data_, other.data_), std::swap(size_, other.size_); }
+  ~Buffer() { std::free(data_); }
+
+  // Make room for `size` elements; the first `keep` survive. New memory is zero.
+  T* reserve(size_t size, size_t keep = 0) {
+    if (size <= size_) return data_;
+    const size_t grown = (size + size / 2 + 63) / 64 * 64;
+    void* memory = std::aligned_alloc(64, grown * sizeof(T));
+    if (memory == nullptr) throw std::bad_alloc();
+    std::memset(memory, 0, grown * sizeof(T));
+    if (keep > 0) std::memcpy(memory, data_, keep * sizeof(T));
+    std::free(data_);
+    data_ = static_cast<T*>(memory);
+    size_ = grown;
+    return data_;
+  }
+
+  T* data() { return data_; }
+  const T* data() const { return data_; }
+  T& operator[](size_t i) { return data_[i]; }
+  const T& operator[](size_t i) const { return data_[i]; }
+
+ private:
+  T* data_ = nullptr;
+  size_t size_ = 0;
+};
+
+}  // namespace bdgs
