@@ -67,9 +67,10 @@ def cells(options: Options) -> list[Cell]:
     names = _QUICK_SCENARIOS if options.quick else tuple(scenarios())
     real_frames = _QUICK_FRAMES if options.quick else None
     synth_frames = SYNTH_FRAMES_QUICK if options.quick else SYNTH_FRAMES
-    common = {'values': dict(options.values)}
     found = []
     for configuration in ('weights', 'geometric'):
+        weights = weights_path(options).name if configuration == 'weights' else ''
+        common = {'values': dict(options.values), 'weights': weights}
         for sequence in REAL:
             settings = {'kind': 'real', 'frames': real_frames, **common}
             found.append(Cell(sequence.name, configuration, 0, settings))
