@@ -6,6 +6,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from typing import Generic, TypeVar
 
 Item = TypeVar('Item')
@@ -45,6 +46,7 @@ class Worker(Generic[Item]):
         self._idle = idle
         self._idle_period_s = idle_period_s
         self._items: deque[Item] = deque()
+        self._first: Callable[[], None] | None = None
         self._changed = threading.Condition()
         self._busy = False
         self._stopping = False
@@ -60,16 +62,18 @@ class Worker(Generic[Item]):
             self._items.append(item)
             self._changed.notify_all()
 
-    def clear(self) -> None:
-        """Forget what waits."""
+    def restart(self, action: Callable[[], None]) -> None:
+        """Forget what waits; call `action` in the thread before anything newer is handled."""
         with self._changed:
             self._items.clear()
+            self._first = action
+            self._changed.notify_all()
 
     def wait_idle(self, timeout_s: float) -> bool:
         """Return whether everything was handled within a time."""
         deadline = time.monotonic() + timeout_s
         with self._changed:
-            while self._items or self._busy:
+            while self._items or self._busy or self._first is not None:
                 left = deadline - time.monotonic()
                 if left <= 0:
                     return False
@@ -86,23 +90,26 @@ class Worker(Generic[Item]):
 
     def _run(self) -> None:
         while not self._stopping:
-            item = self._next()
-            if item is not None:
-                self._guarded(lambda item=item: self._handle(item[0]))
+            call = self._next()
+            if call is not None:
+                self._guarded(call)
                 with self._changed:
                     self._busy = False
                     self._changed.notify_all()
             if not self._stopping:
                 self._guarded(self._idle)
 
-    def _next(self) -> tuple[Item] | None:
+    def _next(self) -> Callable[[], None] | None:
         with self._changed:
-            if not self._items and not self._stopping:
+            if not self._items and self._first is None and not self._stopping:
                 self._changed.wait(self._idle_period_s)
-            if not self._items or self._stopping:
+            if self._stopping or not (self._items or self._first is not None):
                 return None
             self._busy = True
-            return (self._items.popleft(),)
+            if self._first is not None:
+                action, self._first = self._first, None
+                return action
+            return partial(self._handle, self._items.popleft())
 
     def _guarded(self, call: Callable[[], None]) -> None:
         try:

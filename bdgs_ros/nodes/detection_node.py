@@ -16,8 +16,7 @@ from bdgs_ros.bridge.health import Health
 from bdgs_ros.bridge.node_config import DetectionNodeConfig
 from bdgs_ros.bridge.runner import GraphNode, run
 from bdgs_ros.bridge.worker import Worker
-from bdgs_ros.core.config import DetectionConfig, with_values
-from bdgs_ros.core.errors import DatasetError, ModelError
+from bdgs_ros.core.errors import DatasetError
 from bdgs_ros.core.types import Labels
 from bdgs_ros.detection.stage import DetectionStage
 
@@ -30,7 +29,7 @@ class DetectionNode(GraphNode):
         config = parameters.declare(self, DetectionNodeConfig())
         cv2.setNumThreads(1)
         self._health = Health(self, 'detection')
-        self._stage = self._make_stage(config.detection)
+        self._stage = DetectionStage(config.detection)
         self._labels = self.create_publisher(Image, topics.LABELS, topics.RELIABLE)
         self._detections = optional.DetectionsPublisher(self)
         self._decoder = FrameDecoder.of(self)
@@ -42,14 +41,7 @@ class DetectionNode(GraphNode):
         self.create_subscription(
             Empty, topics.RESET_EVENT, lambda _: self._reset(), topics.RELIABLE
         )
-        self.get_logger().info(f'detection is ready: mode {config.mode}')
-
-    def _make_stage(self, config: DetectionConfig) -> DetectionStage:
-        try:
-            return DetectionStage(config)
-        except ModelError as error:
-            self._health.set_problem('weights', f'{error}; going on with the geometric prior')
-            return DetectionStage(with_values(config, {'weights': ''}))
+        self.get_logger().info(f'detection is ready ({self._stage.status}): mode {config.mode}')
 
     def _on_frame(self, raw: RawFrame) -> None:
         try:
@@ -64,6 +56,8 @@ class DetectionNode(GraphNode):
         except Exception as error:  # the prior is a help, not a must: nobody waits in vain
             self._on_error(error)
             labels = Labels(raw.stamp_ns, np.zeros(frame.camera.shape, np.uint8))
+        weights = self._stage.status if self._stage.degraded else ''
+        self._health.set_problem('detector', weights)
         self._publish(labels, raw)
 
     def _publish(self, labels: Labels, raw: RawFrame) -> None:
@@ -78,9 +72,7 @@ class DetectionNode(GraphNode):
         self._health.set_problem('error', f'{type(error).__name__}: {error}')
 
     def _reset(self) -> None:
-        self._worker.clear()
-        self._worker.wait_idle(1.0)
-        self._stage.reset()
+        self._worker.restart(self._stage.reset)
 
     def close(self) -> None:
         """Stop working."""

@@ -1,0 +1,136 @@
+"""What tracking gets from the other nodes: labels of its frame, model views of its keyframes."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from typing import TypeVar
+
+from rclpy.node import Node
+from sensor_msgs.msg import Image
+
+from bdgs_ros.bridge import conversions, topics
+from bdgs_ros.bridge.health import Health
+from bdgs_ros.bridge.model_view import ModelImages, ModelSubscription, decode_model
+from bdgs_ros.bridge.node_config import TrackingNodeConfig
+from bdgs_ros.bridge.stamped import StampBuffer
+from bdgs_ros.core.camera import PinholeCamera
+from bdgs_ros.core.errors import DatasetError
+from bdgs_ros.core.types import Labels, ModelView, Pose, RgbdFrame, TrackingResult
+from bdgs_ros.data.trajectory_io import seconds_to_ns
+
+Item = TypeVar('Item')
+
+_LABELS_KEPT = 30
+_MODELS_KEPT = 4
+_KEYFRAMES_KEPT = 300
+_ABSENT_S = 1.0
+
+
+class Feedback:
+    """
+    Labels and model views, found by stamp.
+
+    In lockstep the exact ones are waited for, since `BdgsSlam` has them too; in real time the
+    newest are taken and nothing is waited for.
+
+    Parameters
+    ----------
+    node : Node
+        It subscribes.
+    config : TrackingNodeConfig
+        Mode and time limits.
+    health : Health
+        Gets told when a peer is silent.
+
+    """
+
+    def __init__(self, node: Node, config: TrackingNodeConfig, health: Health) -> None:
+        self._node = node
+        self._config = config
+        self._health = health
+        self._labels: StampBuffer[Image] = StampBuffer(_LABELS_KEPT)
+        self._models: StampBuffer[tuple[int, ModelImages]] = StampBuffer(_MODELS_KEPT)
+        self._keyframes: OrderedDict[int, tuple[Pose, PinholeCamera]] = OrderedDict()
+        node.create_subscription(
+            Image,
+            topics.LABELS,
+            lambda message: self._labels.put(conversions.stamp_ns(message), message),
+            topics.RELIABLE,
+        )
+        self._subscription = ModelSubscription(
+            node, lambda stamp_ns, images: self._models.put(stamp_ns, (stamp_ns, images))
+        )
+
+    def labels(self, frame: RgbdFrame) -> Labels | None:
+        """Return the labels of a frame, in real time of the newest frame that has any."""
+        message = self._find_labels(frame.stamp_ns)
+        self._health.mark('labels', '' if message else f'no labels on {topics.LABELS}')
+        if message is None:
+            self._health.counts['frames_without_labels'] += 1
+            return None
+        try:
+            p_dynamic = conversions.probability_from_message(message, topics.LABELS)
+            if p_dynamic.shape != frame.camera.shape:
+                raise DatasetError(
+                    f"topic '{topics.LABELS}': expected shape {frame.camera.shape}, "
+                    f'received {p_dynamic.shape}'
+                )
+        except DatasetError as error:
+            self._health.warn(str(error))
+            return None
+        return Labels(conversions.stamp_ns(message), p_dynamic)
+
+    def _find_labels(self, stamp_ns: int) -> Image | None:
+        if self._config.lockstep:
+            return self._wait(self._labels, stamp_ns, topics.LABELS)
+        max_age_ns = seconds_to_ns(self._config.labels_max_age_s)
+        return self._labels.newest(stamp_ns, max_age_ns)
+
+    def _wait(self, buffer: StampBuffer[Item], stamp_ns: int, topic: str) -> Item | None:
+        """Wait for a stamp; not for long where nobody publishes."""
+        present = self._node.count_publishers(topic) > 0
+        timeout_s = self._config.lockstep_timeout_s if present else _ABSENT_S
+        item = buffer.wait(stamp_ns, timeout_s)
+        if item is None:
+            state = 'its publisher is silent' if present else 'it has no publisher'
+            self._health.counts['lockstep_timeouts'] += 1
+            self._health.warn(
+                f"lockstep: nothing on '{self._node.resolve_topic_name(topic)}' for the frame at "
+                f'hand within {timeout_s:g} s, {state}; going on without'
+            )
+        return item
+
+    def note_keyframe(self, result: TrackingResult, camera: PinholeCamera) -> None:
+        """Remember a keyframe's pose: its model view comes back with its stamp only."""
+        if not result.is_keyframe:
+            return
+        self._keyframes[result.stamp_ns] = (result.T_world_camera, camera)
+        while len(self._keyframes) > _KEYFRAMES_KEPT:
+            self._keyframes.popitem(last=False)
+
+    def wait_model(self, stamp_ns: int) -> ModelView | None:
+        """Return the model view of a keyframe; None if mapping has none, or is absent."""
+        found = self._wait(self._models, stamp_ns, topics.MODEL_IMAGE)
+        self._models.clear()
+        return None if found is None else self._decode(*found)
+
+    def new_models(self) -> list[ModelView]:
+        """Return the newest model view that has come since the last call, or nothing."""
+        found = self._models.take_newest()
+        view = None if found is None else self._decode(*found)
+        return [] if view is None else [view]
+
+    def _decode(self, stamp_ns: int, images: ModelImages) -> ModelView | None:
+        if stamp_ns not in self._keyframes:  # from before a reset or a restart
+            self._health.counts['models_of_unknown_keyframes'] += 1
+            return None
+        try:
+            return decode_model(stamp_ns, images, *self._keyframes[stamp_ns])
+        except (DatasetError, ValueError) as error:
+            self._health.warn(str(error))
+            return None
+
+    def clear(self) -> None:
+        """Forget the models; labels of another time are not found by their stamps anyway."""
+        self._models.clear()
+        self._keyframes.clear()

@@ -1,0 +1,99 @@
+"""Publish what tracking found: pose, odometry, path, tf and keyframes."""
+
+from __future__ import annotations
+
+import time
+
+from geometry_msgs.msg import PoseStamped, Vector3
+from nav_msgs.msg import Odometry, Path
+from rclpy.node import Node
+
+from bdgs_ros.bridge import conversions, topics
+from bdgs_ros.bridge.node_config import TrackingNodeConfig
+from bdgs_ros.bridge.optional import TransformPublisher
+from bdgs_ros.core import se3
+from bdgs_ros.core.types import StampedPose, TrackingResult, Trajectory
+
+_PATH_POSES = 2000
+
+
+class PoseOutput:
+    """
+    The trajectory so far, and its topics.
+
+    Parameters
+    ----------
+    node : Node
+        It publishes.
+    config : TrackingNodeConfig
+        Frame ids and periods.
+
+    """
+
+    def __init__(self, node: Node, config: TrackingNodeConfig) -> None:
+        self._config = config
+        self._poses: list[StampedPose] = []
+        self._path_sent_s = 0.0
+        self._pose = node.create_publisher(PoseStamped, topics.POSE, topics.RELIABLE)
+        self._odometry = node.create_publisher(Odometry, topics.ODOMETRY, topics.RELIABLE)
+        self._path = node.create_publisher(Path, topics.PATH, topics.LATCHED)
+        self._keyframe = node.create_publisher(PoseStamped, topics.KEYFRAME, topics.RELIABLE)
+        self._transform = TransformPublisher(node, config.publish_tf)
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The poses published so far."""
+        return Trajectory(tuple(self._poses))
+
+    def clear(self) -> None:
+        """Forget the trajectory."""
+        self._poses = []
+
+    def publish(self, result: TrackingResult, image_frame: str) -> None:
+        """Publish the pose of a frame that was tracked."""
+        child = self._config.camera_frame or image_frame
+        previous = self._poses[-1] if self._poses else None
+        self._poses.append(StampedPose(result.stamp_ns, result.T_world_camera))
+        pose = conversions.pose_stamped(
+            result.T_world_camera, result.stamp_ns, self._config.map_frame
+        )
+        self._pose.publish(pose)
+        if result.is_keyframe:
+            self._keyframe.publish(pose)
+        self._transform.publish(pose, child)
+        self._publish_odometry(result, pose, child, previous)
+        self._publish_path()
+
+    def _publish_odometry(
+        self, result: TrackingResult, pose: PoseStamped, child: str, previous: StampedPose | None
+    ) -> None:
+        message = Odometry(header=pose.header, child_frame_id=child)
+        message.pose.pose = pose.pose
+        message.pose.covariance = conversions.pose_covariance_to_message(
+            result.covariance, result.T_world_camera
+        )
+        if previous is not None:
+            seconds = (result.stamp_ns - previous.stamp_ns) * 1e-9
+            step = se3.inverse(previous.T_world_camera) @ result.T_world_camera
+            velocity = se3.log(step) / seconds
+            x, y, z, rx, ry, rz = (float(value) for value in velocity)
+            message.twist.twist.linear = Vector3(x=x, y=y, z=z)
+            message.twist.twist.angular = Vector3(x=rx, y=ry, z=rz)
+            # the difference of two poses, each with its own error
+            message.twist.covariance = (2 * result.covariance / seconds**2).reshape(-1)
+        self._odometry.publish(message)
+
+    def _publish_path(self) -> None:
+        now = time.monotonic()
+        due = now - self._path_sent_s >= self._config.path_period_s
+        if not due or not self._path.get_subscription_count():
+            return
+        self._path_sent_s = now
+        stride = max(1, len(self._poses) // _PATH_POSES)
+        chosen = self._poses[::stride]
+        path = Path(header=conversions.header(chosen[-1].stamp_ns, self._config.map_frame))
+        path.poses = [
+            conversions.pose_stamped(p.T_world_camera, p.stamp_ns, self._config.map_frame)
+            for p in chosen
+        ]
+        self._path.publish(path)

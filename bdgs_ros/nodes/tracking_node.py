@@ -1,0 +1,152 @@
+"""Publish the camera pose of every frame."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+import cv2
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.parameter import Parameter
+from std_msgs.msg import Empty
+
+from bdgs_ros.bridge import parameters, topics
+from bdgs_ros.bridge.feedback import Feedback
+from bdgs_ros.bridge.frames import FrameDecoder, FrameSource, RawFrame
+from bdgs_ros.bridge.health import Health
+from bdgs_ros.bridge.node_config import TrackingNodeConfig
+from bdgs_ros.bridge.pose_output import PoseOutput
+from bdgs_ros.bridge.runner import GraphNode, run
+from bdgs_ros.bridge.services import serve_switch, serve_trigger
+from bdgs_ros.bridge.status import FrameState, FrameStatus, status_to_message
+from bdgs_ros.bridge.worker import Worker
+from bdgs_ros.core.errors import ConfigError, DatasetError
+from bdgs_ros.core.types import RgbdFrame, TrackingResult, TrackingStatus
+from bdgs_ros.data.trajectory_io import write_trajectory
+from bdgs_ros.tracking.camera_tracker import CameraTracker
+
+
+class TrackingNode(GraphNode):
+    """Where the camera is: `bdgs/pose` and its kin, and `bdgs/status` for every image."""
+
+    def __init__(self, overrides: list[Parameter] | None = None) -> None:
+        super().__init__('tracking_node', parameter_overrides=overrides)
+        config = parameters.declare(self, TrackingNodeConfig(), runtime=('trajectory_file',))
+        cv2.setNumThreads(1)
+        self._config = config
+        self._paused = False
+        self._health = Health(self, 'tracking')
+        self._tracker = CameraTracker(config.tracking)
+        self._output = PoseOutput(self, config)
+        self._status = self.create_publisher(DiagnosticArray, topics.STATUS, topics.RELIABLE)
+        self._reset_event = self.create_publisher(Empty, topics.RESET_EVENT, topics.RELIABLE)
+        self._feedback = Feedback(self, config, self._health)
+        self._decoder = FrameDecoder.of(self)
+        self._worker: Worker[RawFrame] = Worker(
+            self._on_frame, self._on_error, None if config.lockstep else config.frame_queue
+        )
+        serve_trigger(self, topics.RESET, self._on_reset)
+        serve_switch(self, topics.PAUSE, self._on_pause)
+        serve_trigger(self, topics.SAVE_TRAJECTORY, self._on_save)
+        self._source = FrameSource(self, config, self._health, self._worker.put, self._forget)
+        self.get_logger().info(f'tracking is ready: mode {config.mode}')
+
+    def _on_frame(self, raw: RawFrame) -> None:
+        try:
+            frame = None if self._paused else self._decoder.decode(raw)
+        except DatasetError as error:
+            self._health.set_problem('frame', str(error))
+            self._finish(raw, FrameState.SKIPPED)
+            return
+        if frame is None:
+            self._finish(raw, FrameState.PAUSED)
+            return
+        self._health.mark('frame', '')
+        self._track(raw, frame)
+
+    def _track(self, raw: RawFrame, frame: RgbdFrame) -> None:
+        labels = self._feedback.labels(frame)
+        for view in self._feedback.new_models():
+            self._tracker.set_model(view)
+        started = time.perf_counter()
+        result = self._tracker.process(frame, labels)
+        tracking_ms = (time.perf_counter() - started) * 1e3
+        if result.status is TrackingStatus.OK:
+            self._feedback.note_keyframe(result, frame.camera)
+            self._output.publish(result, raw.color.header.frame_id)
+        latency_ms = (time.monotonic() - raw.received_s) * 1e3
+        if result.is_keyframe and self._config.lockstep:
+            self._tracker.set_model(self._feedback.wait_model(result.stamp_ns))
+        self._report(raw, result, tracking_ms, latency_ms)
+
+    def _report(
+        self, raw: RawFrame, result: TrackingResult, tracking_ms: float, latency_ms: float
+    ) -> None:
+        lost = result.status is TrackingStatus.LOST
+        self._health.add_timing('tracking', tracking_ms)
+        self._health.add_timing('image_to_pose', latency_ms)
+        self._health.counts['keyframes'] += result.is_keyframe
+        self._health.set_problem('lost', 'LOST: no pose is published' if lost else '')
+        self._finish(
+            raw,
+            FrameState.LOST if lost else FrameState.OK,
+            result.is_keyframe,
+            result.inlier_ratio,
+            result.overlap,
+            tracking_ms,
+            latency_ms,
+        )
+
+    def _finish(self, raw: RawFrame, state: FrameState, *values: float) -> None:
+        """Acknowledge an image, whatever became of it."""
+        self._health.counts[f'frames_{state.value}'] += 1
+        self._health.counts['frames_dropped'] = self._worker.dropped
+        status = FrameStatus(raw.stamp_ns, state, *values)
+        self._status.publish(status_to_message(status, raw.color.header.frame_id))
+
+    def _on_error(self, error: Exception) -> None:
+        self._health.counts['errors'] += 1
+        self._health.set_problem('error', f'{type(error).__name__}: {error}')
+
+    def _forget(self) -> None:
+        """Start over: the next frame is the origin of the world."""
+        self._worker.restart(self._start_over)
+
+    def _start_over(self) -> None:
+        self._tracker.reset()
+        self._feedback.clear()
+        self._output.clear()
+        self.get_logger().info('reset: the next frame is the origin')
+
+    def _on_reset(self) -> str:
+        self._source.clear()
+        self._forget()
+        self._reset_event.publish(Empty())
+        return 'everything forgotten'
+
+    def _on_pause(self, paused: bool) -> str:
+        self._paused = paused
+        return 'paused' if paused else 'going on'
+
+    def _on_save(self) -> str:
+        file = str(self.get_parameter('trajectory_file').value)
+        if not file:
+            raise ConfigError("where to? set the parameter 'trajectory_file' of tracking_node")
+        trajectory = self._output.trajectory
+        write_trajectory(Path(file), trajectory)
+        self._health.publish()
+        return f"{len(trajectory)} poses in '{file}'"
+
+    def close(self) -> None:
+        """Stop working."""
+        self._worker.stop()
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node."""
+    return run(TrackingNode, args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
