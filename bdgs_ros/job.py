@@ -64,7 +64,7 @@ def run_job(job: Job) -> dict[str, Any]:
         name=sequence.name,
         ground_truth=sequence.ground_truth,
         truth=truth,
-        labels=None if labels is None else labels.score,
+        more=[] if labels is None else labels.score.metrics(),
         config=job.config,
         extra={'frames': [chosen.start, chosen.stop], 'wall_s': wall_s},
         with_pictures=job.pictures,

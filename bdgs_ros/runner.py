@@ -142,10 +142,11 @@ def write_results(
     name: str = '',
     ground_truth: Trajectory | None = None,
     truth: scores.Truth | None = None,
-    labels: LabelScore | None = None,
+    more: Sequence[Metric] = (),
     config: BdgsConfig | None = None,
     frames_expected: int | None = None,
     extra: Mapping[str, Any] | None = None,
+    save_map: bool = True,
     with_pictures: bool = True,
 ) -> dict[str, Any]:
     """
@@ -168,14 +169,16 @@ def write_results(
         For ATE and RPE.
     truth : Truth, optional
         Static views of a synthetic recording.
-    labels : LabelScore, optional
-        Pooled over the run.
+    more : sequence of Metric
+        Further figures, for example the label scores of an observer.
     config : BdgsConfig, optional
         Written into the metrics.
     frames_expected : int, optional
         For the coverage; by default the number of frames that came.
     extra : mapping, optional
         More entries for the metrics file, for example how the run was started.
+    save_map : bool
+        False where `map.ply` in the folder is the map already.
     with_pictures : bool
         Whether to draw.
 
@@ -199,10 +202,11 @@ def write_results(
     expected = len(result.rows) if frames_expected is None else frames_expected
     ate, notes = _compare(ground_truth, est, expected)
     found += _trajectory_metrics(est, expected, ground_truth, ate)
-    found += labels.metrics() if labels is not None else []
+    found += more
     views: list[scores.View] = []
     if static_map is not None:
-        write_aside(folder / 'map.ply', static_map.save)
+        if save_map:
+            write_aside(folder / 'map.ply', static_map.save)
         found += map_metrics(folder / 'map.ply')
         views = scores.render_samples(result.samples, static_map)
         found += scores.render_metrics(views, truth)

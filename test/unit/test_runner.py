@@ -68,7 +68,7 @@ def test_results_are_complete(run, tmp_path):
         name='fake',
         ground_truth=sequence.ground_truth,
         truth=FakeTruth(),
-        labels=labels.score,
+        more=labels.score.metrics(),
     )
     values = {name: entry['value'] for name, entry in metrics['metrics'].items()}
     assert values['ate_rmse'] == pytest.approx(0.0, abs=1e-5)

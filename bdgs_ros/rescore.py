@@ -1,0 +1,127 @@
+"""
+Score and picture a finished run from its files alone: trajectory, map and recording.
+
+For runs over DDS, where the processes that held the frames are gone.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bdgs_ros.core.config import BdgsConfig
+from bdgs_ros.core.errors import EvaluationError
+from bdgs_ros.core.types import Labels, RgbdFrame, TrackingResult, TrackingStatus, Trajectory
+from bdgs_ros.data.trajectory_io import read_trajectory
+from bdgs_ros.eval import scores
+from bdgs_ros.eval.files import write_text
+from bdgs_ros.eval.labels import LabelScore, score_labels
+from bdgs_ros.eval.metric import Metric, dump_json
+from bdgs_ros.eval.recorder import Recorder, RunResult
+from bdgs_ros.job import open_truth
+from bdgs_ros.runner import write_results
+
+
+def rescore(
+    folder: Path, recording: Path, config: BdgsConfig, camera_file: Path | None = None
+) -> dict[str, Any]:
+    """
+    Complete the results of a run that left `trajectory.txt` and `map.ply`.
+
+    The dynamic prior is computed anew by the detection stage; figures that `metrics.json` has
+    already are kept.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the results; gets pictures and a fuller `metrics.json`.
+    recording : Path
+        What was run; frames without a pose in the trajectory count as lost.
+    config : BdgsConfig
+        For the detection stage and the rasteriser.
+    camera_file : Path, optional
+        `camera.yaml` of the recording.
+
+    Returns
+    -------
+    metrics : dict
+        What `metrics.json` holds.
+
+    Raises
+    ------
+    BdgsError
+        If a file is missing or does not belong to the others.
+
+    """
+    from bdgs_ros.data.layouts import open_sequence
+    from bdgs_ros.mapping.mapper import Mapper
+
+    known = _known_metrics(folder / 'metrics.json')
+    sequence = open_sequence(recording, camera_file)
+    est = read_trajectory(folder / 'trajectory.txt')
+    mapper = Mapper(config.mapping, config.belief)
+    mapper.load(folder / 'map.ply')
+    truth = open_truth(recording)
+    result, labels = _relabel(sequence, est, config, truth)
+    metrics = write_results(
+        folder,
+        result,
+        mapper,
+        name=sequence.name,
+        ground_truth=sequence.ground_truth,
+        truth=truth,
+        more=labels,
+        config=config,
+        save_map=False,
+    )
+    metrics['metrics'] = {**metrics['metrics'], **known}
+    write_text(folder / 'metrics.json', dump_json(metrics) + '\n')
+    return metrics
+
+
+def _known_metrics(path: Path) -> Mapping[str, Any]:
+    """Return the figures that a run wrote itself; none if there is no such file."""
+    if not path.is_file():
+        return {}
+    found = json.loads(path.read_text(encoding='utf-8')).get('metrics', {})
+    return found if isinstance(found, dict) else {}
+
+
+def _relabel(
+    sequence: Any, est: Trajectory, config: BdgsConfig, truth: scores.Truth | None
+) -> tuple[RunResult, Sequence[Metric]]:
+    from tqdm import tqdm
+
+    from bdgs_ros.detection.stage import DetectionStage
+
+    poses = {pose.stamp_ns: pose.T_world_camera for pose in est.poses}
+    stage, recorder, score = DetectionStage(config.detection), Recorder(), LabelScore()
+    for frame in tqdm(sequence, 'labels', unit='frame', file=sys.stderr, leave=False):
+        labels = stage.process(frame)
+        recorder.add(frame, _as_tracking(frame, labels, poses), {})
+        if truth is not None:
+            score = score + score_labels(labels.p_dynamic, truth.dynamic(frame.stamp_ns))
+    result = recorder.result()
+    if not result.trajectory.poses:
+        raise EvaluationError(
+            f"none of {len(est)} poses has the stamp of a frame of '{sequence.name}'; "
+            'do trajectory and recording belong together?'
+        )
+    return result, [] if truth is None else score.metrics('prior')
+
+
+def _as_tracking(frame: RgbdFrame, labels: Labels, poses: Mapping[int, Any]) -> TrackingResult:
+    pose = poses.get(frame.stamp_ns)
+    return TrackingResult(
+        frame.stamp_ns,
+        TrackingStatus.LOST if pose is None else TrackingStatus.OK,
+        np.eye(4) if pose is None else pose,
+        np.full((6, 6), np.nan),
+        False,
+        labels.p_dynamic,
+    )
