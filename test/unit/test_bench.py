@@ -1,0 +1,142 @@
+"""The bench harness: resumable, honest about failures, readable results."""
+
+from __future__ import annotations
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from bdgs_ros.bench.harness import Cell, Options, run_bench, to_markdown
+from bdgs_ros.core.errors import DatasetError
+
+
+class FakeBench:
+    NAME = 'fake'
+    PROTOCOL = 'Counts\nits calls.'
+
+    def __init__(self):
+        self.ran = []
+        self.broken = set()
+
+    def cells(self, options):
+        return [
+            Cell(sequence, configuration, seed, {'values': dict(options.values)})
+            for sequence in ('a', 'b')
+            for configuration in ('x', 'y')
+            for seed in options.seeds
+        ]
+
+    def run_cell(self, cell, options):
+        self.ran.append(cell.label)
+        if cell.label in self.broken:
+            raise DatasetError('no such recording')
+        return {'score': np.float64(len(self.ran)), 'none': float('nan')}
+
+    def summarise(self, rows):
+        return {'total': sum(row['score'] for row in rows)}
+
+
+@pytest.fixture
+def options(tmp_path):
+    return Options(work=tmp_path / 'work', data=tmp_path)
+
+
+def test_finished_cells_are_not_measured_again(options):
+    bench = FakeBench()
+    first = run_bench(bench, options)
+    assert len(bench.ran) == 4
+    second = run_bench(bench, options)
+    assert len(bench.ran) == 4
+    assert second['rows'] == first['rows']
+    run_bench(bench, options, force=True)
+    assert len(bench.ran) == 8
+
+
+def test_other_settings_are_other_cells(options):
+    bench = FakeBench()
+    run_bench(bench, options)
+    run_bench(bench, Options(options.work, options.data, values={'mapping.iterations': '5'}))
+    run_bench(bench, Options(options.work, options.data, seeds=(0, 1)))
+    assert len(bench.ran) == 4 + 4 + 4
+
+
+@pytest.mark.parametrize(
+    ('only', 'count'), [(['a'], 2), (['y'], 2), (['a/x/0'], 1), (['a', 'b'], 4), (['c*'], 0)]
+)
+def test_only_chooses_by_sequence_configuration_or_label(options, only, count):
+    bench = FakeBench()
+    assert len(run_bench(bench, options, only)['rows']) == count == len(bench.ran)
+
+
+def test_a_failure_stays_in_the_table_and_is_tried_again(options):
+    bench = FakeBench()
+    bench.broken = {'a/y/0'}
+    results = run_bench(bench, options)
+    assert results['failed'] == 1
+    assert [row.get('error') for row in results['rows']].count('no such recording') == 1
+    assert 'no such recording' in to_markdown(results)
+    bench.broken = set()
+    assert run_bench(bench, options)['failed'] == 0
+    assert len(bench.ran) == 5
+
+
+def test_an_interrupted_bench_goes_on_where_it_stopped(options, monkeypatch):
+    bench = FakeBench()
+    run_cell = bench.run_cell
+
+    def interrupted(cell, opts):
+        if len(bench.ran) == 2:
+            raise KeyboardInterrupt
+        return run_cell(cell, opts)
+
+    monkeypatch.setattr(bench, 'run_cell', interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run_bench(bench, options)
+    monkeypatch.setattr(bench, 'run_cell', run_cell)
+    run_bench(bench, options)
+    assert bench.ran == ['a/x/0', 'a/y/0', 'b/x/0', 'b/y/0']
+
+
+def test_results_say_where_they_come_from(options):
+    run_bench(FakeBench(), options)
+    results = json.loads((options.work / 'results.json').read_text())
+    assert results['summary'] == {'total': 10.0}
+    assert results['protocol'] == 'Counts its calls.'
+    assert results['provenance']['machine']['cores'] >= 1
+    assert len(results['commits']) == 1
+    assert results['rows'][0]['none'] is None
+    page = (options.work / 'results.md').read_text()
+    assert '| a | x | 0 | 1 | - |' in page
+    assert '| total | 10 |' in page
+
+
+def test_slam_summary_picks_and_pools():
+    from bdgs_ros.bench import slam
+
+    rows = [
+        {'sequence': 'bonn_crowd_part', 'configuration': 'w', 'ate_rmse_cm': 3.0,
+         'coverage_percent': 100.0},
+        {'sequence': 'synth_a', 'configuration': 'w', 'ate_rmse_cm': 1.0, 'psnr_db': 20.0,
+         'coverage_percent': 90.0},
+        {'sequence': 'synth_b', 'configuration': 'w', 'ate_rmse_cm': 2.0, 'psnr_db': None},
+    ]  # fmt: skip
+    assert slam.summarise(rows) == {
+        'bonn_crowd_part_ate_cm_w': 3.0,
+        'synth_ate_rmse_cm_median_w': 1.5,
+        'synth_psnr_db_median_w': 20.0,
+        'synth_ate_rmse_cm_worst_w': 2.0,
+        'coverage_percent_min': 90.0,
+    }
+
+
+def test_missing_recordings_and_weights_are_named(tmp_path):
+    from bdgs_ros.bench import sequences, slam
+    from bdgs_ros.core.errors import ModelError
+
+    with pytest.raises(DatasetError, match='BDGS_SHARED'):
+        sequences.real_path('fr1_rpy_part', tmp_path)
+    cell = SimpleNamespace(configuration='weights')
+    with pytest.raises(ModelError, match=r'yolov5n-320\.onnx.*--weights'):
+        slam._config(cell, Options(tmp_path, tmp_path))
