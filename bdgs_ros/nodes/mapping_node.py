@@ -31,6 +31,7 @@ from bdgs_ros.core.types import Keyframe, ModelView, ProbabilityImage, RgbdFrame
 from bdgs_ros.mapping.mapper import Mapper
 
 _FRAME_WAIT_S = 2.0
+_PENDING_S = 30.0
 _LABELS_WAIT_S = 0.3
 _LABELS_KEPT = 90
 _MAX_LABEL_AGE_NS = 500_000_000
@@ -150,7 +151,7 @@ class MappingNode(GraphNode):
         period_s = self._config.autosave_s
         version, saved_s = self._saved
         if period_s and self._version != version and time.monotonic() - saved_s >= period_s:
-            self._on_save()
+            self._save()
 
     def _latest_viewpoint(self) -> Viewpoint | None:
         if self._pose is None or self._frame is None:
@@ -169,6 +170,7 @@ class MappingNode(GraphNode):
         self._health.set_problem('error', f'{type(error).__name__}: {error}')
 
     def _forget(self) -> None:
+        self._frames.clear()
         self._worker.restart(self._start_over)
 
     def _start_over(self) -> None:
@@ -185,6 +187,10 @@ class MappingNode(GraphNode):
         return Path(file)
 
     def _on_save(self) -> str:
+        self._worker.wait_idle(_PENDING_S)  # keyframes that have arrived belong into the file
+        return self._save()
+
+    def _save(self) -> str:
         file = self._map_file()
         with self._lock:
             self._mapper.save(file)
