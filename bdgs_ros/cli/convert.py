@@ -34,9 +34,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help='zstd takes several times longer (default: %(default)s)')  # fmt: skip
     parser.add_argument('--depth-encoding', choices=DEPTH_ENCODINGS,
                         default=_DEFAULTS.depth_encoding,
-                        help='32FC1: metres, exact; 16UC1: millimetres, half the size')  # fmt: skip
+                        help='32FC1: metres, exact; 16UC1: mm, half the size')  # fmt: skip
     parser.add_argument('--camera', type=Path, metavar='FILE',
-                        help='camera.yaml with size, intrinsics, distortion, depth scale')  # fmt: skip
+                        help='camera.yaml to use instead of what is known')  # fmt: skip
     parser.add_argument('--start', type=float, default=_DEFAULTS.start_s, metavar='S',
                         help='skip this many seconds')  # fmt: skip
     parser.add_argument('--duration', type=float, metavar='S',

@@ -36,10 +36,9 @@ def run(args: argparse.Namespace) -> int:
 def _as_text(summary: Summary) -> str:
     lines = [
         f'{summary.path}: {summary.kind}, {summary.duration_s:.2f} s'
-        + (', cut off' if summary.truncated else '')
+        + (', cut off' if summary.truncated else ''),
+        *(f'  {t.name:<44} {t.msgtype:<34} {t.count:>7}' for t in summary.topics),
     ]
-    for topic in summary.topics:
-        lines.append(f'  {topic.name:<44} {topic.msgtype:<34} {topic.count:>7}')
     if summary.problem:
         return '\n'.join([*lines, f'not usable as an RGB-D recording: {summary.problem}']) + '\n'
     lines += [f'{s.name:<7} {_stream(s)}' for s in (summary.color, summary.depth) if s]

@@ -143,6 +143,9 @@ class BagReader:
         """Time from the first to the last message."""
         return (self.end_ns - self.start_ns) / NS_PER_S
 
+    def _metadata_file(self) -> Path:
+        return self.path / METADATA_FILE
+
     def _files(self) -> list[Path]:
         return _storage_files(self.path) if self.path.is_dir() else [self.path]
 
@@ -176,6 +179,8 @@ class BagReader:
             )
 
     def _attempt(self, paths: list[Any]) -> AnyReader:
+        if paths == [self.path] and self.path.is_dir() and not self._metadata_file().is_file():
+            raise DatasetError(f"'{self.path}' cannot be read as a bag: it has no {METADATA_FILE}")
         try:
             reader = AnyReader(paths, default_typestore=jazzy())
             reader.open()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,7 +57,7 @@ _TOPICS = {
 }
 _ORDER = list(_TOPICS)  # among messages of the same stamp: camera_info before its image
 _UINT16_MAX = 65535
-_FOREVER = QosTime(2147483647, 4294967295)
+_FOREVER = QosTime(9223372036, 854775807)
 _QOS = Qos(
     QosHistory.KEEP_LAST,
     10,
@@ -119,7 +119,7 @@ class _Event(NamedTuple):
 
     stamp_ns: int
     order: int
-    index: int
+    item: int
 
 
 def convert(
@@ -176,7 +176,7 @@ def _events(recording: Recording, options: ConvertOptions) -> list[_Event]:
     low = first_ns + seconds_to_ns(options.start_s)
     high = None if options.duration_s is None else low + seconds_to_ns(options.duration_s)
     truth = recording.ground_truth
-    stamps = {
+    stamps: dict[str, Iterable[int]] = {
         GROUND_TRUTH_TOPIC: [] if truth is None else truth.stamps_ns,
         INFO_TOPIC: recording.color_stamps_ns,
         COLOR_TOPIC: recording.color_stamps_ns,
@@ -211,7 +211,8 @@ def _check_space(
     free = shutil.disk_usage(parent).free
     if options.compression == 'none' and needed > free:
         raise DatasetError(
-            f"'{bag}' needs {needed / 1e9:.2f} GB, but '{parent}' has only {free / 1e9:.2f} GB free"
+            f"'{bag}' needs {needed / 1e9:.2f} GB, but '{parent}' has only "
+            f'{free / 1e9:.2f} GB free'
         )
 
 
@@ -223,25 +224,28 @@ def _existing_parent(path: Path) -> Path:
 def _aside(bag: Path, force: bool) -> Iterator[Path]:
     """Give a folder to write to that becomes `bag` at the end, and is removed on any failure."""
     aside = bag.resolve().parent / f'.{bag.name}.partial-{os.getpid()}'
+    replaced = aside / '.replaced'
     try:
         shutil.rmtree(aside, ignore_errors=True)
         aside.mkdir(parents=True)
         # the storage file is named after its folder
         yield aside / bag.name
         if bag.exists() and force:
-            bag.rename(aside / 'replaced')
+            bag.rename(replaced)
         (aside / bag.name).rename(bag)
     except OSError as error:
         raise DatasetError(f"cannot write '{bag}': {error}") from error
     finally:
+        if replaced.exists() and not bag.exists():
+            replaced.rename(bag)
         shutil.rmtree(aside, ignore_errors=True)
 
 
 def _write(
     folder: Path, recording: Recording, events: list[_Event], options: ConvertOptions
 ) -> None:
-    # version 8 is what Jazzy writes
-    writer = Writer(folder, version=8, storage_plugin=STORAGES[options.storage])
+    # version 9 is what Jazzy writes
+    writer = Writer(folder, version=9, storage_plugin=STORAGES[options.storage])
     if options.compression == 'zstd':
         in_chunks = options.storage == 'mcap'
         mode = CompressionMode.STORAGE if in_chunks else CompressionMode.MESSAGE
@@ -254,7 +258,9 @@ def _write(
             if topic != GROUND_TRUTH_TOPIC or recording.ground_truth is not None
         ]
         by_topic = {connection.topic: connection for connection in connections}
-        bar = tqdm(events, unit='msg', desc=folder.name, disable=not options.progress)
+        bar = tqdm(
+            events, unit='msg', desc=folder.name, disable=None if options.progress else True
+        )
         for event in bar:
             data = _serialize(recording, event, options.depth_encoding)
             writer.write(by_topic[_ORDER[event.order]], event.stamp_ns, data)
@@ -263,17 +269,17 @@ def _write(
 def _serialize(recording: Recording, event: _Event, depth_encoding: str) -> bytes:
     topic = _ORDER[event.order]
     if topic == COLOR_TOPIC:
-        color = recording.read_color(event.index)
+        color = recording.read_color(event.item)
         return serialize_image(event.stamp_ns, CAMERA_FRAME, color, 'rgb8')
     if topic == DEPTH_TOPIC:
-        depth = encode_depth(recording.read_depth(event.index), depth_encoding)
+        depth = encode_depth(recording.read_depth(event.item), depth_encoding)
         return serialize_image(event.stamp_ns, CAMERA_FRAME, depth, depth_encoding)
     if topic == INFO_TOPIC:
         return serialize_camera_info(event.stamp_ns, CAMERA_FRAME, recording.camera)
     truth = recording.ground_truth
     if truth is None:
         raise DatasetError(f"'{recording.name}' has no ground truth")
-    return serialize_pose(event.stamp_ns, WORLD_FRAME, truth.poses[event.index].T_world_camera)
+    return serialize_pose(event.stamp_ns, WORLD_FRAME, truth.poses[event.item].T_world_camera)
 
 
 def encode_depth(depth_m: DepthImage, encoding: str) -> np.ndarray[Any, Any]:
@@ -288,7 +294,7 @@ def _report(
     bag: Path, recording: Recording, events: list[_Event], options: ConvertOptions
 ) -> ConvertReport:
     counts = np.bincount([event.order for event in events], minlength=len(_ORDER))
-    color = [event.index for event in events if _ORDER[event.order] == COLOR_TOPIC]
+    color = [event.item for event in events if _ORDER[event.order] == COLOR_TOPIC]
     sequence = RecordedSequence(recording, options.max_difference_s)
     paired = {i for i, _ in sequence.pairs}
     stamps = [event.stamp_ns for event in events]

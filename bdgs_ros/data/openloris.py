@@ -98,7 +98,7 @@ def _open(path: Path) -> Any:
         if path.is_file() and storage.isOpened():
             return storage
         reason = 'it is missing or empty'
-    except cv2.error as error:
+    except (cv2.error, SystemError) as error:  # OpenCV 5 raises the second for bad yaml
         reason = str(error)
     raise DatasetError(f"cannot read the OpenLORIS calibration '{path}': {reason}")
 
