@@ -824,7 +824,7 @@ PYBIND11_MODULE(BDGS_MODULE, m) {
   m.doc() = "Gaussian rasteriser; use bdgs_ros.mapping.rasterize, which checks its arguments";
   m.def("supports", &supports);
   m.def("adam_step", &adam_step);
-  py::class_<Rasterizer>(m, "Rasterizer")
+  py::class_<Rasterizer>(m, "Rasterizer", py::module_local())
       .def(py::init<>())
       .def("render", &render)
       .def("backward", &backward)

@@ -1,4 +1,5 @@
-// One step of Adam (Kingma and Ba, 2015, algorithm 1), in place.
+// One step of Adam (Kingma and Ba, 2015, algorithm 1), in place; step 0 leaves out the correction of
+// the moments' bias.
 
 #pragma once
 
@@ -13,7 +14,7 @@
 namespace bdgs {
 
 struct AdamStep {
-  float rate, beta1, beta2, eps, correction2;  // rate is divided by 1 - beta1^t
+  float rate, beta1, beta2, eps, correction2;  // bias correction folded into rate
 };
 
 inline void adam_lanes(const AdamStep& s, float* p, const float* g, float* m, float* v) {
@@ -61,11 +62,12 @@ inline void adam_step(pybind11::array_t<float, 16> params, pybind11::array_t<flo
                       int step, double rate, std::array<double, 2> betas, double eps,
                       pybind11::object mask, int threads) {
   AdamStep s{};
-  s.rate = static_cast<float>(rate / (1.0 - std::pow(betas[0], step)));
+  const bool corrected = step > 0;
+  s.rate = static_cast<float>(corrected ? rate / (1.0 - std::pow(betas[0], step)) : rate);
   s.beta1 = static_cast<float>(betas[0]);
   s.beta2 = static_cast<float>(betas[1]);
   s.eps = static_cast<float>(eps);
-  s.correction2 = static_cast<float>(1.0 / (1.0 - std::pow(betas[1], step)));
+  s.correction2 = corrected ? static_cast<float>(1.0 / (1.0 - std::pow(betas[1], step))) : 1.0f;
   const ptrdiff_t size = params.size();
   const ptrdiff_t columns = params.ndim() > 1 ? params.shape(1) : 1;
   float *p = params.mutable_data(), *m = first.mutable_data(), *v = second.mutable_data();

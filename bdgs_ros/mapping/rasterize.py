@@ -1,0 +1,329 @@
+"""
+Render Gaussians and differentiate the rendering, by the fastest backend that runs here.
+
+The native backend is `src/rasterizer.cpp`, which explains the algorithm; its readable twin is
+`rasterize_torch`, which the tests hold it to and which serves where nothing was compiled.
+"""
+
+from __future__ import annotations
+
+import logging
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bdgs_ros.core.camera import PinholeCamera
+from bdgs_ros.core.errors import MapError
+from bdgs_ros.mapping.rasterize_native import VARIANTS, NativeBackend, load_module
+from bdgs_ros.mapping.rasterize_types import (
+    Array,
+    Backend,
+    FusedResult,
+    Gaussians,
+    Gradients,
+    LossWeights,
+    Pose,
+    Rendered,
+    Scene,
+    Target,
+    as_float32,
+    expect_shape,
+)
+
+__all__ = [
+    'FusedResult',
+    'Gaussians',
+    'Gradients',
+    'LossWeights',
+    'Rendered',
+    'adam_step',
+    'available_backends',
+    'backward',
+    'fused_step',
+    'render',
+]
+
+_LOGGER = logging.getLogger(__name__)
+
+
+@lru_cache(maxsize=1)
+def available_backends() -> tuple[str, ...]:
+    """Return the names of the backends that run here, fastest first; 'torch' is always there."""
+    return (*(v for v in VARIANTS if load_module(v) is not None), 'torch')
+
+
+@lru_cache(maxsize=16)
+def _backend(name: str) -> Backend:
+    """Resolve 'auto', 'native', a build's name or 'torch'."""
+    available = available_backends()
+    natives = [v for v in available if v != 'torch']
+    if name in ('auto', 'native') and natives:
+        name = natives[0]
+    elif name == 'auto':
+        _LOGGER.warning(
+            'no compiled rasteriser: using its torch twin, about 100 times slower; '
+            'install a C++17 compiler with OpenMP and reinstall bdgs_ros'
+        )
+        name = 'torch'
+    if name not in available:
+        raise MapError(
+            f'rasteriser backend {name!r} cannot run here; available: {", ".join(available)}'
+        )
+    if name != 'torch':
+        module = load_module(name)
+        assert module is not None
+        return NativeBackend(module)
+    from bdgs_ros.mapping.rasterize_torch import TorchBackend  # torch takes seconds to import
+
+    return TorchBackend()
+
+
+def render(
+    g: Gaussians,
+    T_camera_world: Pose,
+    camera: PinholeCamera,
+    *,
+    active: NDArray[np.bool_] | None = None,
+    statistics: bool = False,
+    threads: int = 1,
+    backend: str = 'auto',
+) -> Rendered:
+    """
+    Render one view on black.
+
+    Parameters
+    ----------
+    g : Gaussians
+        What to draw.
+    T_camera_world : ndarray, shape (4, 4)
+        Rigid; maps world to the camera's optical frame.
+    camera : PinholeCamera
+        Rectified.
+    active : ndarray of bool, shape (N,), optional
+        M_g of Eq. 11: others are not drawn. All by default.
+    statistics : bool
+        Also return visibility, largest weight and radius of each Gaussian.
+    threads : int
+        Of the native backend. Results do not depend on it.
+    backend : str
+        'auto', 'native', 'torch', or one of `available_backends()`.
+
+    Returns
+    -------
+    Rendered
+
+    Raises
+    ------
+    ValueError
+        If an array has the wrong shape.
+    MapError
+        If the backend cannot run here.
+
+    """
+    scene = _scene(g, T_camera_world, camera, active, threads)
+    return _backend(backend).render(scene, statistics)
+
+
+def backward(
+    g: Gaussians,
+    T_camera_world: Pose,
+    camera: PinholeCamera,
+    dL_dcolor: Array,
+    dL_ddepth: Array,
+    dL_dsilhouette: Array,
+    *,
+    active: NDArray[np.bool_] | None = None,
+    threads: int = 1,
+    backend: str = 'auto',
+) -> Gradients:
+    """
+    Carry derivatives by the rendered images back to the Gaussians and the camera.
+
+    Parameters
+    ----------
+    g, T_camera_world, camera, active, threads, backend
+        As for `render`.
+    dL_dcolor : ndarray, shape (H, W, 3)
+        By `Rendered.color`.
+    dL_ddepth, dL_dsilhouette : ndarray, shape (H, W)
+        By `Rendered.depth` and `Rendered.silhouette`.
+
+    Returns
+    -------
+    Gradients
+
+    Raises
+    ------
+    ValueError
+        If an array has the wrong shape.
+    MapError
+        If the backend cannot run here.
+
+    """
+    scene = _scene(g, T_camera_world, camera, active, threads)
+    images = (
+        as_float32('dL_dcolor', dL_dcolor, (*camera.shape, 3)),
+        as_float32('dL_ddepth', dL_ddepth, camera.shape),
+        as_float32('dL_dsilhouette', dL_dsilhouette, camera.shape),
+    )
+    return _backend(backend).backward(scene, images)
+
+
+def fused_step(
+    g: Gaussians,
+    T_camera_world: Pose,
+    camera: PinholeCamera,
+    target_color: Array,
+    target_depth: Array,
+    pixel_weight: Array,
+    weights: LossWeights,
+    *,
+    exposure: tuple[float, float] = (0.0, 0.0),
+    active: NDArray[np.bool_] | None = None,
+    with_images: bool = False,
+    threads: int = 1,
+    backend: str = 'auto',
+) -> FusedResult:
+    """
+    Render, compare with what the camera saw, and differentiate: one optimisation step's work.
+
+    The colour term is Eq. 9 between `exp(log_gain) * color + offset` and the target. SSIM windows
+    are cut to the pixels with weight > 0 and normalised over them. The depth term is
+    |depth - silhouette * D|, which needs no division: depth / silhouette - D would grow without
+    bound where the silhouette goes to 0. Both are means weighted by `pixel_weight`.
+
+    Parameters
+    ----------
+    g, T_camera_world, camera, active, threads, backend
+        As for `render`.
+    target_color : ndarray, shape (H, W, 3)
+        RGB in [0, 1].
+    target_depth : ndarray, shape (H, W)
+        Metres; 0 or NaN where unknown.
+    pixel_weight : ndarray, shape (H, W)
+        Such as P(static); pixels at 0 have no influence at all.
+    weights : LossWeights
+        Of the terms.
+    exposure : (float, float)
+        log_gain and offset of this view.
+    with_images : bool
+        Also return what was rendered.
+
+    Returns
+    -------
+    FusedResult
+
+    Raises
+    ------
+    ValueError
+        If an array has the wrong shape.
+    MapError
+        If the backend cannot run here.
+
+    """
+    scene = _scene(g, T_camera_world, camera, active, threads)
+    target = Target(
+        as_float32('target_color', target_color, (*camera.shape, 3)),
+        as_float32('target_depth', target_depth, camera.shape),
+        as_float32('pixel_weight', pixel_weight, camera.shape),
+        (float(exposure[0]), float(exposure[1])),
+    )
+    return _backend(backend).fused_step(scene, target, weights, with_images)
+
+
+def adam_step(
+    params: Array,
+    grads: Array,
+    first: Array,
+    second: Array,
+    *,
+    rate: float,
+    step: int | None = None,
+    rows: NDArray[np.bool_] | None = None,
+    betas: tuple[float, float] = (0.9, 0.999),
+    eps: float = 1e-15,
+    threads: int = 1,
+    backend: str = 'auto',
+) -> None:
+    """
+    Make one step of Adam in place.
+
+    Parameters
+    ----------
+    params, first, second : ndarray, float32, shape (N, ...)
+        Parameters and their moments; changed. Must lie in rows (C order).
+    grads : ndarray, shape (N, ...)
+        Gradient by `params`.
+    rate : float
+        Step size.
+    step : int, optional
+        Number of this step from 1, for Adam's correction of the young moments' bias. None leaves
+        the correction out, as is usual where rows are updated at different times.
+    rows : ndarray of bool, shape (N,), optional
+        Rows to touch; the others keep parameters and moments.
+    betas, eps
+        Adam's decay rates, and its guard against division by zero.
+    threads, backend
+        As for `render`.
+
+    Raises
+    ------
+    ValueError
+        If shapes differ, an array to change is not float32 in C order, or step < 1.
+
+    """
+    for name, array in (('params', params), ('first', first), ('second', second)):
+        expect_shape(name, array, params.shape)
+        if array.dtype != np.float32 or not array.flags.c_contiguous:
+            raise ValueError(f'{name}: expected float32 in C order, received {array.dtype}')
+    if step is not None and step < 1:
+        raise ValueError(f'step: expected 1 or more, received {step}')
+    if rows is not None:
+        expect_shape('rows', rows, params.shape[:1])
+        rows = np.ascontiguousarray(rows, dtype=np.bool_)
+    arrays = (params, as_float32('grads', grads, params.shape), first, second)
+    chosen = _backend(backend)
+    if isinstance(chosen, NativeBackend):
+        chosen.adam_step(arrays, rows, (step or 0, rate, betas, eps), threads)
+    else:
+        _adam_numpy(arrays, rows, (step or 0, rate, betas, eps))
+
+
+def _adam_numpy(
+    arrays: tuple[Array, Array, Array, Array],
+    rows: NDArray[np.bool_] | None,
+    constants: tuple[int, float, tuple[float, float], float],
+) -> None:
+    params, grads, first, second = arrays
+    step, rate, (beta1, beta2), eps = constants
+    at = slice(None) if rows is None else rows
+    m = beta1 * first[at] + (1 - beta1) * grads[at]
+    v = beta2 * second[at] + (1 - beta2) * grads[at] ** 2
+    correct1, correct2 = (1 - beta1**step, 1 - beta2**step) if step else (1.0, 1.0)
+    first[at], second[at] = m, v
+    params[at] -= rate / correct1 * m / (np.sqrt(v / correct2) + eps)
+
+
+def _scene(
+    g: Gaussians,
+    T_camera_world: Pose,
+    camera: PinholeCamera,
+    active: NDArray[np.bool_] | None,
+    threads: int,
+) -> Scene:
+    count = len(g.means)
+    shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, 3), (count,))
+    names = ('means', 'quats', 'log_scales', 'logit_opacities', 'colors', 'p_dynamic')
+    arrays = [
+        as_float32(f'g.{name}', array, shape)
+        for name, array, shape in zip(names, g.arrays(), shapes, strict=True)
+    ]
+    expect_shape('T_camera_world', T_camera_world, (4, 4))
+    if active is not None:
+        expect_shape('active', active, (count,))
+        active = np.ascontiguousarray(active, dtype=np.bool_)
+    if threads < 1:
+        raise ValueError(f'threads: expected 1 or more, received {threads}')
+    pose = np.ascontiguousarray(T_camera_world, dtype=np.float64)
+    return Scene(Gaussians(*arrays), active, pose, camera, threads)

@@ -1,0 +1,128 @@
+"""The compiled rasteriser, src/rasterizer.cpp, behind the `Backend` protocol."""
+
+from __future__ import annotations
+
+import importlib
+import threading
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bdgs_ros.mapping.rasterize_types import (
+    Array,
+    FusedResult,
+    Gradients,
+    LossWeights,
+    Rendered,
+    Scene,
+    Target,
+)
+
+VARIANTS = ('avx512', 'avx2', 'base')
+"""Builds of the one source, best first."""
+
+
+def load_module(variant: str) -> ModuleType | None:
+    """Import a build, or return None where it is missing or the processor cannot run it."""
+    try:
+        base = importlib.import_module('bdgs_ros._rasterizer_base')
+        if not base.supports(variant):
+            return None
+        return importlib.import_module(f'bdgs_ros._rasterizer_{variant}')
+    except ImportError:
+        return None
+
+
+class NativeBackend:
+    """One build; each Python thread has its own workspace, so calls may run side by side."""
+
+    def __init__(self, module: ModuleType) -> None:
+        self._module = module
+        self._local = threading.local()
+
+    @property
+    def workspace(self) -> Any:
+        """The calling thread's `Rasterizer`, which keeps its buffers between calls."""
+        if not hasattr(self._local, 'rasterizer'):
+            self._local.rasterizer = self._module.Rasterizer()
+        return self._local.rasterizer
+
+    def render(self, scene: Scene, statistics: bool) -> Rendered:
+        """Render `scene`."""
+        images = _empty_images(scene)
+        count = len(scene.gaussians)
+        extra = tuple(np.empty(count, np.float32) for _ in range(3)) if statistics else None
+        self.workspace.render(*_arguments(scene), images, extra)
+        return Rendered(*images, *(extra or ()))
+
+    def backward(self, scene: Scene, dL_dimages: tuple[Array, Array, Array]) -> Gradients:
+        """Return derivatives, given those by color, depth and silhouette."""
+        arrays = _empty_gradients(len(scene.gaussians))
+        pose = self.workspace.backward(*_arguments(scene), *dL_dimages, arrays)
+        return Gradients(*arrays[:5], pose)
+
+    def fused_step(
+        self, scene: Scene, target: Target, weights: LossWeights, with_images: bool
+    ) -> FusedResult:
+        """Render, compare and differentiate."""
+        arrays = _empty_gradients(len(scene.gaussians))
+        images = _empty_images(scene) if with_images else None
+        terms = (weights.color * (1 - weights.ssim), weights.color * weights.ssim, weights.depth)
+        loss, l1, ssim, depth, d_log_gain, d_offset, pose = self.workspace.fused_step(
+            *_arguments(scene),
+            target.color,
+            target.depth,
+            target.weight,
+            terms,
+            target.exposure,
+            arrays,
+            images,
+        )
+        return FusedResult(
+            loss,
+            l1,
+            ssim,
+            depth,
+            Gradients(*arrays[:5], pose),
+            np.array([d_log_gain, d_offset], np.float32),
+            arrays[5],
+            Rendered(*images) if images else None,
+        )
+
+    def adam_step(
+        self,
+        arrays: tuple[Array, Array, Array, Array],
+        rows: NDArray[np.bool_] | None,
+        constants: tuple[int, float, tuple[float, float], float],
+        threads: int,
+    ) -> None:
+        """Update (params, grads, first, second) in place; constants are step, rate, betas, eps."""
+        mask = None if rows is None else rows.view(np.uint8)
+        self._module.adam_step(*arrays, *constants, mask, threads)
+
+
+def _arguments(scene: Scene) -> tuple[Any, ...]:
+    camera = scene.camera
+    return (
+        scene.gaussians.arrays(),
+        None if scene.active is None else scene.active.view(np.uint8),
+        camera.width,
+        camera.height,
+        (camera.fx, camera.fy, camera.cx, camera.cy),
+        scene.T_camera_world.ravel(),
+        scene.threads,
+    )
+
+
+def _empty_images(scene: Scene) -> tuple[Array, Array, Array, Array]:
+    shape = scene.camera.shape
+    color = np.empty((*shape, 3), np.float32)
+    return (color, *(np.empty(shape, np.float32) for _ in range(3)))  # type: ignore[return-value]
+
+
+def _empty_gradients(count: int) -> tuple[Array, ...]:
+    """Means, quats, log_scales, logit_opacities, colors and visibility."""
+    shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, 3), (count,))
+    return tuple(np.empty(shape, np.float32) for shape in shapes)
