@@ -13,6 +13,7 @@ from bdgs_ros.core.config import BdgsConfig
 from bdgs_ros.core.errors import DatasetError
 from bdgs_ros.core.types import RgbdFrame
 from bdgs_ros.data.sequence import Sequence
+from bdgs_ros.data.synth.truth import SynthTruth
 from bdgs_ros.runner import LabelObserver, run_sequence, write_results
 
 
@@ -87,13 +88,9 @@ def choose_frames(available: int, start: int, count: int | None) -> range:
     return range(start, stop)
 
 
-def open_truth(recording: Path) -> Any:
+def open_truth(recording: Path) -> SynthTruth | None:
     """Return the truth of a synthetic recording, or None for any other."""
-    if not (recording / 'truth').is_dir():
-        return None
-    from bdgs_ros.data.synth.truth import SynthTruth
-
-    return SynthTruth(recording)
+    return SynthTruth(recording) if SynthTruth.available(recording) else None
 
 
 def _with_progress(sequence: Sequence, chosen: range, show: bool) -> Iterator[RgbdFrame]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -54,7 +55,16 @@ def synth_path(scenario: str, seed: int, frames: int, work: Path) -> Path:
     """Return the folder of a synthetic recording, made now if it is not there yet."""
     path = work / 'synth' / f'{scenario}_{seed}_{frames}'
     if not path.is_dir():
-        from bdgs_ros.data.synth import write_recording
-
-        write_recording(path, scenario, seed=seed, frames=frames)
+        _record(path, scenario, seed, frames)
     return path
+
+
+def _record(path: Path, scenario: str, seed: int, frames: int) -> None:
+    from tqdm import tqdm
+
+    from bdgs_ros.data.synth import write_recording
+
+    with tqdm(total=frames, desc=path.name, unit='frame', file=sys.stderr, leave=False) as bar:
+        write_recording(
+            path, scenario, seed, frames, progress=lambda done, total: bar.update(done - bar.n)
+        )

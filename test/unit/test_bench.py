@@ -140,3 +140,29 @@ def test_missing_recordings_and_weights_are_named(tmp_path):
     cell = SimpleNamespace(configuration='weights')
     with pytest.raises(ModelError, match=r'yolov5n-320\.onnx.*--weights'):
         slam._config(cell, Options(tmp_path, tmp_path))
+
+
+def test_rasterizer_scene_fills_the_view():
+    from bdgs_ros.bench import rasterizer
+    from bdgs_ros.mapping.rasterize import render
+
+    camera = rasterizer.make_camera(64, 48)
+    scene = rasterizer.make_scene(1500, camera, np.random.default_rng(0))
+    z = scene.means[:, 2]
+    assert 0.5 < z.min() < 2.5
+    assert z.max() <= 3.0 + 1e-5
+    assert render(scene, np.eye(4), camera).silhouette.mean() > 0.7
+
+
+def test_rasterizer_rows_have_every_column(tmp_path):
+    from bdgs_ros.bench import rasterizer
+
+    settings = {'gaussians': 300, 'width': 32, 'height': 24, 'backend': 'auto', 'threads': 1}
+    cell = Cell('small', 'auto_1', 0, settings)
+    row = rasterizer.run_cell(cell, Options(tmp_path, tmp_path))
+    times = ['forward_ms', 'backward_ms', 'fused_ms']
+    assert list(row) == [
+        'gaussians', 'width', 'height', 'threads', 'backend', *times, 'gradient_error',
+    ]  # fmt: skip
+    assert all(row[name] > 0 for name in times)
+    assert row['gradient_error'] < 1e-3
