@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import sys
+from typing import Any
 
 import cv2
 import numpy as np
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image
 from std_msgs.msg import Empty
 
@@ -24,8 +24,8 @@ from bdgs_ros.detection.stage import DetectionStage
 class DetectionNode(GraphNode):
     """Who could be moving: `bdgs/labels`, for the colour image of the same stamp."""
 
-    def __init__(self, overrides: list[Parameter] | None = None) -> None:
-        super().__init__('detection_node', parameter_overrides=overrides)
+    def __init__(self, **options: Any) -> None:
+        super().__init__('detection_node', **options)
         config = parameters.declare(self, DetectionNodeConfig())
         cv2.setNumThreads(1)
         self._health = Health(self, 'detection')

@@ -6,13 +6,13 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from geometry_msgs.msg import PoseStamped
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.executors import MultiThreadedExecutor
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image
 from std_msgs.msg import Empty
 
@@ -40,8 +40,8 @@ _MAX_LABEL_AGE_NS = 500_000_000
 class MappingNode(GraphNode):
     """What the static world looks like: `bdgs/model`, `bdgs/rendered` and `bdgs/map`."""
 
-    def __init__(self, overrides: list[Parameter] | None = None) -> None:
-        super().__init__('mapping_node', parameter_overrides=overrides)
+    def __init__(self, **options: Any) -> None:
+        super().__init__('mapping_node', **options)
         config = parameters.declare(self, MappingNodeConfig(), runtime=('map_file',))
         cv2.setNumThreads(1)
         self._config = config

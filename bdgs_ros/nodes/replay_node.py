@@ -6,9 +6,9 @@ import sys
 import threading
 import time
 from collections import OrderedDict
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 
 from bdgs_ros.bridge import conversions, parameters, topics
@@ -38,8 +38,8 @@ class _StoppedError(Exception):
 class ReplayNode(GraphNode):
     """Play a bag: its bytes untouched, `/clock`, and a count of what consumers missed."""
 
-    def __init__(self, overrides: list[Parameter] | None = None) -> None:
-        super().__init__('replay_node', parameter_overrides=overrides)
+    def __init__(self, **options: Any) -> None:
+        super().__init__('replay_node', **options)
         config = parameters.declare(self, ReplayConfig())
         if not config.bag:
             raise ConfigError("what to play? set the parameter 'bag' to the path of a recording")

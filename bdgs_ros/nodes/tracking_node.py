@@ -5,10 +5,10 @@ from __future__ import annotations
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import cv2
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.parameter import Parameter
 from std_msgs.msg import Empty
 
 from bdgs_ros.bridge import parameters, topics
@@ -30,8 +30,8 @@ from bdgs_ros.tracking.camera_tracker import CameraTracker
 class TrackingNode(GraphNode):
     """Where the camera is: `bdgs/pose` and its kin, and `bdgs/status` for every image."""
 
-    def __init__(self, overrides: list[Parameter] | None = None) -> None:
-        super().__init__('tracking_node', parameter_overrides=overrides)
+    def __init__(self, **options: Any) -> None:
+        super().__init__('tracking_node', **options)
         config = parameters.declare(self, TrackingNodeConfig(), runtime=('trajectory_file',))
         cv2.setNumThreads(1)
         self._config = config

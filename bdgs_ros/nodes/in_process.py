@@ -1,0 +1,53 @@
+"""Run several nodes in threads of this process: the other way to bring up the graph."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping, Sequence
+
+from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
+from rclpy.parameter import Parameter
+
+from bdgs_ros.bridge.runner import GraphNode
+
+
+class InProcessNodes:
+    """
+    Nodes with a thread each.
+
+    Parameters
+    ----------
+    ros_arguments : list of str
+        Remaps and log levels that hold for all nodes.
+
+    """
+
+    def __init__(self, ros_arguments: Sequence[str]) -> None:
+        self._arguments = ['--ros-args', *ros_arguments]
+        self._nodes: list[GraphNode] = []
+        self._stopping = False
+
+    def start(self, kind: type[GraphNode], values: Mapping[str, object]) -> None:
+        """Make a node and spin it."""
+        node = kind(
+            parameter_overrides=[Parameter(name, value=value) for name, value in values.items()],
+            cli_args=self._arguments,
+            use_global_arguments=False,  # they name this process's main node
+        )
+        self._nodes.append(node)
+        threading.Thread(target=self._spin, args=(node,), daemon=True).start()
+
+    def _spin(self, node: GraphNode) -> None:
+        executor = MultiThreadedExecutor(2)
+        executor.add_node(node)
+        try:
+            while not self._stopping:
+                executor.spin_once(timeout_sec=0.5)
+        except ExternalShutdownException:
+            return
+
+    def stop(self) -> None:
+        """End the nodes."""
+        self._stopping = True
+        for node in self._nodes:
+            node.close()

@@ -1,0 +1,198 @@
+"""Bring up the whole graph, with a replay if asked for: the one command that users need."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from std_srvs.srv import Trigger
+
+from bdgs_ros.bridge import parameters, topics
+from bdgs_ros.bridge.node_config import NODE_CONFIGS, SlamConfig
+from bdgs_ros.bridge.observer import GraphObserver
+from bdgs_ros.bridge.processes import Child, Children, forwarded_arguments
+from bdgs_ros.bridge.runner import REFUSED, GraphNode, run
+from bdgs_ros.core.config import BdgsConfig, specs, with_values
+from bdgs_ros.core.errors import BdgsError, ConfigError
+from bdgs_ros.nodes.in_process import InProcessNodes
+
+_GRAPH = {
+    'detection_node': 'DetectionNode',
+    'tracking_node': 'TrackingNode',
+    'mapping_node': 'MappingNode',
+}
+_WATCH_PERIOD_S = 0.1
+_SERVICE_TIMEOUT_S = 120.0
+
+
+class SlamNode(GraphNode):
+    """Start, watch and end the graph; at the end of a recording, write the results."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__('slam_node', **options)
+        self._config = parameters.declare(self, SlamConfig())
+        self._values = {name: p.value for name, p in self._parameter_overrides.items()}
+        self._slam_config = check_everything(self._config, self._values)
+        self._started_s = time.time()
+        self._concluding = False
+        self._observer = GraphObserver(self)
+        self._savers = {
+            name: self.create_client(Trigger, name)
+            for name in (topics.SAVE_TRAJECTORY, topics.SAVE_MAP)
+        }
+        arguments = forwarded_arguments(sys.argv)
+        self._children = Children(arguments)
+        self._threads = InProcessNodes(arguments)
+        self._start_graph()
+        self._timer = self.create_timer(
+            _WATCH_PERIOD_S, self._watch, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
+
+    def _start_graph(self) -> None:
+        values = {**self._result_files(), **self._values}
+        for name, kind in _GRAPH.items():
+            if self._config.processes == 'several':
+                self._children.start(name, values)
+            else:
+                module = import_module(f'bdgs_ros.nodes.{name}')
+                self._threads.start(getattr(module, kind), values)
+        if self._config.bag:
+            self._children.start('replay_node', {'wait_subscribers': len(_GRAPH), **values})
+
+    def _result_files(self) -> dict[str, str]:
+        if not self._config.output:
+            return {}
+        folder = Path(self._config.output).resolve()
+        folder.mkdir(parents=True, exist_ok=True)
+        return {
+            'trajectory_file': str(folder / 'trajectory.txt'),
+            'map_file': str(folder / 'map.ply'),
+        }
+
+    def _watch(self) -> None:
+        for child, status in self._children.ended():
+            if child.name == 'replay_node':
+                self._on_replay_end(child, status)
+            else:
+                self._on_death(child, status)
+
+    def _on_replay_end(self, child: Child, status: int) -> None:
+        child.done = True
+        if status:
+            self.get_logger().fatal(f'the replay ended with status {status}')
+            self.finish(status)
+        elif self._config.exit_at_end and not self._concluding:
+            self._concluding = True
+            threading.Thread(target=self._conclude, daemon=True).start()
+
+    def _on_death(self, child: Child, status: int) -> None:
+        """Start a node again, unless it has refused its parameters or dies all the time."""
+        if status == REFUSED or child.respawns >= self._config.respawns:
+            child.done = True
+            self.get_logger().fatal(f'{child.name} ended with status {status}')
+            self.finish(status or 1)
+            return
+        child.respawns += 1
+        self.get_logger().error(
+            f'{child.name} ended with status {status}; starting it again '
+            f'({child.respawns} of {self._config.respawns})'
+        )
+        values = dict(child.values)
+        if child.name == 'mapping_node' and self._has_saved_map(values):
+            values['load_at_start'] = True
+        self._children.start(child.name, values)
+
+    def _has_saved_map(self, values: dict[str, object]) -> bool:
+        file = Path(str(values.get('map_file', '')))
+        return file.is_file() and file.stat().st_mtime >= self._started_s
+
+    def _conclude(self) -> None:
+        """Write the results, in a thread: the answers of the services come to the executor."""
+        try:
+            for name in self._savers:
+                self._call(name)
+            self._write_metrics()
+            self.finish()
+        except (BdgsError, OSError) as error:
+            self.get_logger().fatal(str(error))
+            self.finish(1)
+
+    def _call(self, name: str) -> None:
+        client = self._savers[name]
+        if not client.wait_for_service(_SERVICE_TIMEOUT_S):
+            raise BdgsError(f"nobody offers '{name}'")
+        done = threading.Event()
+        future = client.call_async(Trigger.Request())
+        future.add_done_callback(lambda _: done.set())
+        if not done.wait(_SERVICE_TIMEOUT_S):
+            raise BdgsError(f"'{name}' did not answer within {_SERVICE_TIMEOUT_S:g} s")
+        if not future.result().success:
+            raise BdgsError(f"'{name}': {future.result().message}")
+
+    def _write_metrics(self) -> None:
+        from bdgs_ros.data.bag import open_bag
+        from bdgs_ros.data.bag_recording import BagRecording
+
+        folder = Path(self._config.output).resolve()
+        with open_bag(self._config.bag) as reader:
+            recording = BagRecording(reader)
+            metrics = self._observer.write_metrics(
+                folder,
+                self._slam_config,
+                recording.name,
+                recording.ground_truth,
+                {
+                    'wall_s': time.time() - self._started_s,
+                    'mode': self._config.mode,
+                    'processes': self._config.processes,
+                    'respawns': sum(c.respawns for c in self._children.children.values()),
+                },
+            )
+        found = metrics['metrics']
+        shown = ('frames_sent', 'frames_in', 'frames_lost', 'frames_missed', 'ate_rmse')
+        text = ', '.join(f'{k} {found[k]["value"]:.6g}' for k in shown if k in found)
+        self.get_logger().info(f"results in '{folder}': {text}")
+
+    def close(self) -> None:
+        """End the graph."""
+        self._children.stop()
+        self._threads.stop()
+
+
+def check_everything(config: SlamConfig, values: dict[str, Any]) -> BdgsConfig:
+    """
+    Check the parameters of all nodes before any of them is started.
+
+    Returns
+    -------
+    config : BdgsConfig
+        What the stages will use.
+
+    Raises
+    ------
+    ConfigError
+        For the first value that a node would refuse.
+
+    """
+    for kind in NODE_CONFIGS.values():
+        names = {spec.name for spec in specs(kind())}
+        with_values(kind(), {n: v for n, v in values.items() if n in names})
+    if config.exit_at_end and not (config.bag and config.output):
+        raise ConfigError("'exit_at_end' needs 'bag' (what to replay) and 'output' (a folder)")
+    stage_names = {spec.name for spec in specs(BdgsConfig())}
+    return with_values(BdgsConfig(), {n: v for n, v in values.items() if n in stage_names})
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the graph."""
+    return run(SlamNode, args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
