@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from bdgs_ros.core.config import BeliefConfig
 from bdgs_ros.mapping.rasterize import Gaussians
 
 Array = NDArray[np.float32]
+Scalar = TypeVar('Scalar', np.float32, np.int32)
 
 PARAMETERS = ('means', 'quats', 'log_scales', 'logit_opacities', 'colors')
 
@@ -142,5 +144,5 @@ def _moments_like(array: Array) -> list[Array]:
     return [np.zeros_like(array), np.zeros_like(array)]
 
 
-def _join(a: NDArray[np.generic], b: NDArray[np.generic]) -> NDArray[np.generic]:
+def _join(a: NDArray[Scalar], b: NDArray[Scalar]) -> NDArray[Scalar]:
     return np.ascontiguousarray(np.concatenate([a, b]))

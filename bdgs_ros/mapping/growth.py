@@ -28,7 +28,7 @@ def insertion_candidates(keyframe: MapKeyframe, config: InsertConfig) -> Mask:
     moving = (level.weight == 0).astype(np.uint8)
     reach = 2 * config.margin_px + 1
     far_from_movers = cv2.dilate(moving, np.ones((reach, reach), np.uint8)) == 0
-    return usable_depth(level.depth_m, config) & far_from_movers
+    return np.asarray(usable_depth(level.depth_m, config) & far_from_movers)
 
 
 def usable_depth(depth_m: DepthImage, config: InsertConfig) -> Mask:
@@ -115,7 +115,7 @@ def worth_keeping(gaussians: GaussianMap, config: PruneConfig) -> Mask:
     if excess > 0:
         rank = np.where(keep, gaussians.logit_opacities, np.inf)
         keep[np.argpartition(rank, excess)[:excess]] = False
-    return keep
+    return np.asarray(keep)
 
 
 def confirmed_gone(gaussians: GaussianMap, seen_through: Mask, config: BeliefConfig) -> Mask:

@@ -189,7 +189,7 @@ class Mapper:
         camera = keyframe.frame.camera
         static = self.render(keyframe.T_world_camera, camera)
         known = static.silhouette > self._config.model.silhouette
-        safe = np.maximum(static.silhouette, 1e-6)
+        safe = np.maximum(static.silhouette, np.float32(1e-6))
         color = static.color / safe[..., None]
         return ModelView(
             keyframe.frame.stamp_ns,

@@ -1,0 +1,99 @@
+"""Where Gaussians may come from and when they go."""
+
+import numpy as np
+import pytest
+
+from bdgs_ros.core.camera import PinholeCamera
+from bdgs_ros.core.config import BeliefConfig, MappingConfig
+from bdgs_ros.core.types import Keyframe, RgbdFrame
+from bdgs_ros.mapping import growth
+from bdgs_ros.mapping.gaussians import GaussianMap, NewGaussians
+from bdgs_ros.mapping.keyframes import MapKeyframe, build_levels, shrink
+
+CAMERA = PinholeCamera(64, 48, 60.0, 60.0, 31.5, 23.5)
+INSERT = MappingConfig().insert
+
+
+def keyframe(depth: np.ndarray, moving: np.ndarray | None = None) -> MapKeyframe:
+    moving = np.zeros(CAMERA.shape, bool) if moving is None else moving
+    color = np.full((48, 64, 3), 128, np.uint8)
+    levels = build_levels(color, depth.astype(np.float32), moving, CAMERA, 3)
+    return MapKeyframe(0, 0, np.eye(4), np.zeros(CAMERA.shape, np.uint8), levels)
+
+
+def test_nothing_comes_from_movers_or_their_margin() -> None:
+    moving = np.zeros(CAMERA.shape, bool)
+    moving[10:20, 10:20] = True
+    candidates = growth.insertion_candidates(keyframe(np.full((48, 64), 2.0), moving), INSERT)
+    margin = INSERT.margin_px
+    assert not candidates[10 - margin : 20 + margin, 10 - margin : 20 + margin].any()
+    assert candidates.sum() > 300
+
+
+def test_nothing_comes_from_edges_or_bad_depth() -> None:
+    depth = np.full((48, 64), 2.0)
+    depth[:, 32:] = 3.0
+    depth[5:10] = 0
+    depth[40:] = INSERT.max_depth + 1
+    candidates = growth.insertion_candidates(keyframe(depth), INSERT)
+    assert not candidates[:, 31:33].any()
+    assert not candidates[5:10].any()
+    assert not candidates[40:].any()
+
+
+def test_lifted_gaussians_project_back_to_their_pixels() -> None:
+    kf = keyframe(np.random.default_rng(0).uniform(1, 3, (48, 64)))
+    pixels = np.zeros(CAMERA.shape, bool)
+    pixels[7, 9] = pixels[30, 50] = True
+    new = growth.lift(kf, pixels, 0.3, INSERT)
+    np.testing.assert_allclose(CAMERA.project(new.means), [[9, 7], [50, 30]], atol=1e-3)
+    expected = INSERT.sigma_px * INSERT.stride * new.means[:, 2] / CAMERA.fx
+    np.testing.assert_allclose(new.scales, expected, rtol=1e-5)
+
+
+def small_map(opacities: list[float], scales: list[float]) -> GaussianMap:
+    gaussians = GaussianMap(BeliefConfig())
+    count = len(opacities)
+    for opacity, scale in zip(opacities, scales, strict=True):
+        new = NewGaussians(
+            np.zeros((1, 3), np.float32),
+            np.array([scale], np.float32),
+            np.zeros((1, 3), np.float32),
+            np.array([0.3], np.float32),
+        )
+        gaussians.append(new, opacity, 0)
+    assert len(gaussians) == count
+    return gaussians
+
+
+def test_faint_and_large_gaussians_go() -> None:
+    config = MappingConfig().prune
+    gaussians = small_map([0.9, config.opacity / 2, 0.9], [0.01, 0.01, 2 * config.scale])
+    assert growth.worth_keeping(gaussians, config).tolist() == [True, False, False]
+
+
+def test_the_budget_takes_the_faintest() -> None:
+    config = type(MappingConfig().prune)(max_gaussians=100)
+    gaussians = small_map([0.3 + 0.004 * i for i in range(120)], [0.01] * 120)
+    keep = growth.worth_keeping(gaussians, config)
+    assert keep.sum() == 100
+    assert keep[20:].all()
+
+
+def test_only_what_is_seen_through_is_deleted() -> None:
+    gaussians = small_map([0.9] * 3, [0.01] * 3)
+    gaussians.belief.smoothed[:] = [0.99, 0.99, 0.2]
+    gone = growth.confirmed_gone(gaussians, np.array([True, False, True]), BeliefConfig())
+    assert gone.tolist() == [True, False, False]
+
+
+@pytest.mark.parametrize('width', [64, 32])
+def test_shrinking_keeps_depths_measured_and_movers_present(width: int) -> None:
+    depth = np.where(np.arange(64) % 2, 1.0, 3.0).astype(np.float32)[None].repeat(48, 0)
+    prior = np.zeros((48, 64), np.uint8)
+    prior[11, 13] = 255
+    frame = RgbdFrame(0, np.zeros((48, 64, 3), np.uint8), depth, CAMERA)
+    small = shrink(Keyframe(frame, np.eye(4), prior), width)
+    assert small.frame.camera.width == width
+    assert set(np.unique(small.frame.depth_m)) <= {1.0, 3.0}
+    assert small.p_dynamic.max() == 255
