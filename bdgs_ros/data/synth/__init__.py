@@ -1,0 +1,12 @@
+"""
+Synthetic RGB-D recordings with exact truth.
+
+`write_recording` makes one; `SynthTruth` reads what is true about it. What each file means is
+written in `bdgs_ros.data.synth.truth`.
+"""
+
+from bdgs_ros.data.synth.scenarios import scenarios
+from bdgs_ros.data.synth.truth import SynthTruth
+from bdgs_ros.data.synth.writer import RecordingSummary, write_recording
+
+__all__ = ['RecordingSummary', 'SynthTruth', 'scenarios', 'write_recording']

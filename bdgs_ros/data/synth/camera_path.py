@@ -1,0 +1,135 @@
+"""
+How the camera moves: the motions of TUM's freiburg3 walking sequences, and gentler ones.
+
+Every path starts and rests for a moment, is smooth (sums of sinusoids under a smooth envelope)
+and stays at speeds that people reach with a hand-held camera: about 0.2-0.4 m/s and 10-30 deg/s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+Motion = Callable[[float, Array], tuple[Array, Array]]
+"""Time and the six phases of a seed to (offset right, down, ahead in m; rotation vector)."""
+
+_REST_S = (0.3, 1.3)  # the motion fades in between these times
+
+
+def look_at(position: Array, target: Array) -> Array:
+    """Return T_world_camera of an upright camera (x right, y down, z ahead) in a z-up world."""
+    ahead = (target - position) / np.linalg.norm(target - position)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = np.column_stack([right, np.cross(ahead, right), ahead])
+    T[:3, 3] = position
+    return T
+
+
+def _wave(t: float, period_s: float, phase: float) -> float:
+    return float(np.sin(2 * np.pi * t / period_s + phase))
+
+
+def _in_turn(t: float, period_s: float, axes: int) -> Array:
+    """Return weights with which each axis leads in turn, the others nearly at rest."""
+    angle = 2 * np.pi * (t / period_s - np.arange(axes) / axes)
+    return np.asarray(0.15 + 0.85 * (0.5 + 0.5 * np.cos(angle)) ** 2)
+
+
+def _handheld(t: float, phase: Array) -> tuple[Array, Array]:
+    offset = [0.004 * _wave(t, 1.1, phase[0]) + 0.003 * _wave(t, 0.55, phase[3])]
+    offset += [0.003 * _wave(t, 0.9, phase[1]), 0.003 * _wave(t, 1.4, phase[2])]
+    angles = [0.004 * _wave(t, 0.8, phase[4]) + 0.002 * _wave(t, 0.37, phase[0])]
+    angles += [0.006 * _wave(t, 1.3, phase[5]), 0.003 * _wave(t, 1.0, phase[1])]
+    return np.array(offset), np.array(angles)
+
+
+def _xyz(t: float, phase: Array) -> tuple[Array, Array]:
+    lead = _in_turn(t, 9.0, 3)
+    waves = [_wave(t, p, f) for p, f in zip((5.0, 4.7, 5.3), phase, strict=False)]
+    offset = np.array([0.30, 0.22, 0.30]) * lead * waves
+    jitter_m, jitter_rad = _handheld(t, phase)
+    return offset + jitter_m, 4 * jitter_rad
+
+
+def _rpy(t: float, phase: Array) -> tuple[Array, Array]:
+    lead = _in_turn(t, 9.0, 3)
+    waves = [_wave(t, p, f) for p, f in zip((4.4, 4.8, 4.6), phase, strict=False)]
+    angles = np.radians(20) * lead * waves
+    jitter_m, jitter_rad = _handheld(t, phase)
+    return 5 * jitter_m, angles + jitter_rad
+
+
+def _gentle(t: float, phase: Array) -> tuple[Array, Array]:
+    offset = np.array([0.22, 0.07, 0.12]) * [
+        _wave(t, p, f) for p, f in zip((6.5, 5.7, 7.9), phase, strict=False)
+    ]
+    angles = np.radians([3.0, 7.0, 2.0]) * [
+        _wave(t, p, f) for p, f in zip((5.1, 7.3, 6.1), phase[3:], strict=False)
+    ]
+    jitter_m, jitter_rad = _handheld(t, phase)
+    return offset + jitter_m, angles + jitter_rad
+
+
+def _survey(t: float, phase: Array) -> tuple[Array, Array]:
+    offset, angles = _gentle(t, phase)
+    return 1.3 * offset, 1.6 * angles
+
+
+_MOTIONS: dict[str, Motion] = {
+    'handheld': _handheld,
+    'xyz': _xyz,
+    'rpy': _rpy,
+    'gentle': _gentle,
+    'survey': _survey,
+}
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """One camera motion about a resting pose that looks at `target`."""
+
+    kind: str
+    position: Array
+    target: Array
+    phase: Array
+
+    def pose(self, time_s: float) -> Array:
+        """Return T_world_camera at a time in seconds from the first frame."""
+        fade = float(np.clip((time_s - _REST_S[0]) / (_REST_S[1] - _REST_S[0]), 0, 1))
+        fade = fade**3 * (10 - 15 * fade + 6 * fade**2)
+        if self.kind == 'halfsphere':
+            return self._on_halfsphere(time_s, fade)
+        offset, angles = _MOTIONS[self.kind](time_s, self.phase)
+        T = look_at(self.position, self.target)
+        T[:3, 3] += T[:3, :3] @ (fade * offset)
+        T[:3, :3] = T[:3, :3] @ Rotation.from_rotvec(fade * angles).as_matrix()
+        return T
+
+    def _on_halfsphere(self, t: float, fade: float) -> Array:
+        """Move on a half sphere of 1 m diameter before the scene, always looking at it."""
+        azimuth = np.radians(65) * fade * _wave(t, 9.0, self.phase[0])
+        height = np.radians(10 + fade * (15 + 25 * _wave(t, 6.5, self.phase[1])))
+        centre = self.position + np.array([0.5, 0.0, -0.1])
+        out = [-np.cos(azimuth) * np.cos(height), -np.sin(azimuth) * np.cos(height)]
+        T = look_at(centre + 0.5 * np.array([*out, np.sin(height)]), self.target)
+        jitter_m, jitter_rad = _handheld(t, self.phase)
+        T[:3, 3] += fade * jitter_m
+        T[:3, :3] = T[:3, :3] @ Rotation.from_rotvec(fade * jitter_rad).as_matrix()
+        return T
+
+
+def camera_path(kind: str, rng: np.random.Generator, position: Array, target: Array) -> CameraPath:
+    """Return a camera path of a kind, its place and phases varied a little by the seed."""
+    return CameraPath(
+        kind,
+        position + rng.uniform(-0.12, 0.12, 3) * (1, 1, 0.5),
+        target + rng.uniform(-0.15, 0.15, 3) * (1, 1, 0.5),
+        rng.uniform(0, 2 * np.pi, 6),
+    )

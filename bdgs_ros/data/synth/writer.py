@@ -1,0 +1,400 @@
+"""Write a synthetic recording: every frame on its own, so that any number of processes may help."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bdgs_ros.core import se3
+from bdgs_ros.core.camera import PinholeCamera
+from bdgs_ros.core.errors import DatasetError
+from bdgs_ros.data.synth.render import FrameImages, FrameRenderer
+from bdgs_ros.data.synth.scenarios import World, make_world, scenarios
+from bdgs_ros.data.synth.scene import SceneObject
+from bdgs_ros.data.synth.sensor import (
+    DEPTH_SCALE,
+    ColorSensor,
+    DepthSensor,
+    auto_exposure,
+    sense_color,
+    sense_depth,
+)
+from bdgs_ros.data.synth.truth import SynthTruth, stamp_text
+
+Progress = Callable[[int, int], None]
+"""Called with the number of frames done and their total."""
+
+_FIRST_STAMP_NS = 1000 * 10**9
+_EXPOSURE_S = 0.012
+_METER_SIZE = 80  # width in pixels of the image that sets the exposure
+_METER_EVERY = 4  # frames
+_FOLDERS = ('rgb', 'depth')
+_TRUTH_FOLDERS = ('dynamic', 'object_id', 'static_color', 'static_depth')
+_FR3 = (640, 480, 535.4, 539.2, 320.1, 247.6)
+
+
+@dataclass(frozen=True)
+class RecordingPlan:
+    """What is recorded; equal plans give equal files."""
+
+    scenario: str
+    seed: int
+    frames: int
+    width: int
+    height: int
+    rate_hz: float
+
+    def validate(self) -> None:
+        """Raise `DatasetError` for a plan that cannot be recorded."""
+        if self.scenario not in scenarios():
+            raise DatasetError(
+                f"no scenario '{self.scenario}'; there are: {', '.join(scenarios())}"
+            )
+        if self.frames < 1 or self.seed < 0 or not 0 < self.rate_hz <= 1000:
+            raise DatasetError(
+                f'frames {self.frames}, seed {self.seed}, rate {self.rate_hz:g} Hz: expected '
+                'at least 1 frame, a seed of 0 or more and a rate in (0, 1000] Hz'
+            )
+        if min(self.width, self.height) < 32 or max(self.width, self.height) > 4096:
+            raise DatasetError(
+                f'size {self.width}x{self.height}: expected 32 to 4096 pixels each way'
+            )
+
+    @property
+    def camera(self) -> PinholeCamera:
+        """The camera of TUM freiburg3 at the size of the plan, without distortion."""
+        width, height, fx, fy, cx, cy = _FR3
+        sx, sy = self.width / width, self.height / height
+        return PinholeCamera(
+            self.width,
+            self.height,
+            fx * sx,
+            fy * sy,
+            (cx + 0.5) * sx - 0.5,
+            (cy + 0.5) * sy - 0.5,
+        )
+
+    def time_s(self, frame: int) -> float:
+        """Return the time of a frame since the first."""
+        return (self.stamp_ns(frame) - _FIRST_STAMP_NS) * 1e-9
+
+    def stamp_ns(self, frame: int) -> int:
+        """Return the stamp of a frame, a whole number of microseconds."""
+        return _FIRST_STAMP_NS + round(frame * 1e6 / self.rate_hz) * 1000
+
+    def world(self) -> World:
+        """Return the world that is recorded."""
+        return make_world(self.scenario, self.seed, self.frames / self.rate_hz)
+
+
+@dataclass(frozen=True)
+class RecordingSummary:
+    """What was written; coverage is the share of pixels that see something moving."""
+
+    folder: str
+    scenario: str
+    seed: int
+    frames: int
+    duration_s: float
+    mean_coverage: float
+    max_coverage: float
+
+
+class FrameWorker:
+    """Render and write single frames of a plan; one lives in each process."""
+
+    def __init__(self, plan: RecordingPlan, folder: Path) -> None:
+        self._plan, self._folder = plan, folder
+
+    @cached_property
+    def world(self) -> World:
+        """The world of the plan."""
+        return self._plan.world()
+
+    @cached_property
+    def _renderer(self) -> FrameRenderer:
+        return FrameRenderer(self.world, self._plan.camera, _EXPOSURE_S)
+
+    @cached_property
+    def _meter(self) -> FrameRenderer:
+        camera = self._plan.camera
+        small = camera.scaled(min(1.0, _METER_SIZE / camera.width))
+        return FrameRenderer(self.world, small, 0.0)
+
+    def brightness(self, frame: int) -> float:
+        """Return the mean light of a frame."""
+        return self._meter.brightness(self._plan.time_s(frame))
+
+    def write(self, frame: int, gain: float) -> float:
+        """Write all images of a frame and return its dynamic coverage."""
+        time_s = self._plan.time_s(frame)
+        images = self._renderer.render(time_s)
+        dynamic = np.isin(images.object_id, self.world.scene.moving_ids(time_s))
+        rng = np.random.default_rng([self._plan.seed, 2, frame])
+        name = f'{stamp_text(self._plan.stamp_ns(frame))}.png'
+        for kind, image in self._files(images, dynamic, gain, rng).items():
+            _write_png(self._folder / kind / name, image)
+        return float(dynamic.mean())
+
+    def _files(
+        self,
+        images: FrameImages,
+        dynamic: NDArray[np.bool_],
+        gain: float,
+        rng: np.random.Generator,
+    ) -> dict[str, NDArray[Any]]:
+        color = sense_color(images.color, gain, ColorSensor(), rng)
+        static = np.minimum(images.static_color + 0.5, 255).astype(np.uint8)
+        units = np.minimum(images.static_depth_m * DEPTH_SCALE + 0.5, 65535)
+        return {
+            'rgb': color[..., ::-1],
+            'depth': sense_depth(images.depth_m, self._plan.camera, DepthSensor(), rng),
+            'truth/dynamic': dynamic.astype(np.uint8) * 255,
+            'truth/object_id': images.object_id,
+            'truth/static_color': static[..., ::-1],
+            'truth/static_depth': units.astype(np.uint16),
+        }
+
+
+def _write_png(path: Path, image: NDArray[Any]) -> None:
+    flags = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+    good, data = cv2.imencode('.png', np.ascontiguousarray(image), flags)
+    if not good:
+        raise DatasetError(f"cannot encode '{path}'")
+    path.write_bytes(data.tobytes())
+
+
+_worker: FrameWorker | None = None  # of this process, set by `_start`
+
+
+def _start(plan: RecordingPlan, folder: Path) -> None:
+    global _worker
+    cv2.setNumThreads(1)
+    _worker = FrameWorker(plan, folder)
+
+
+def _brightness(frame: int) -> float:
+    assert _worker is not None
+    return _worker.brightness(frame)
+
+
+def _write(frame: int, gain: float) -> float:
+    assert _worker is not None
+    return _worker.write(frame, gain)
+
+
+def write_recording(
+    folder: Path,
+    scenario: str,
+    seed: int,
+    frames: int = 300,
+    *,
+    size: tuple[int, int] = (640, 480),
+    rate_hz: float = 30.0,
+    jobs: int | None = None,
+    force: bool = False,
+    progress: Progress | None = None,
+) -> RecordingSummary:
+    """
+    Write a synthetic recording; the files depend on scenario, seed, frames, size and rate alone.
+
+    Parameters
+    ----------
+    folder : Path
+        Where it goes; it appears there when it is complete and not before.
+    scenario : str
+        One of `scenarios()`.
+    seed, frames : int
+        Seed of everything that varies, and length.
+    size : (int, int)
+        Width and height in pixels; the field of view stays that of TUM freiburg3.
+    rate_hz : float
+        Frames per second.
+    jobs : int, optional
+        Processes that share the work, by default one for each processor.
+    force : bool
+        Replace a recording that is there. A folder with anything else is never replaced.
+    progress : callable, optional
+        Called as `progress(done, frames)`.
+
+    Raises
+    ------
+    DatasetError
+        If the plan is impossible, or the folder holds something that may not be replaced.
+
+    """
+    plan = RecordingPlan(scenario, seed, frames, size[0], size[1], rate_hz)
+    plan.validate()
+    folder = Path(folder)
+    _check_target(folder, force)
+    with _set_aside(folder) as partial:
+        for name in (*_FOLDERS, *(f'truth/{kind}' for kind in _TRUTH_FOLDERS)):
+            (partial / name).mkdir(parents=True)
+        workers = min(jobs or os.cpu_count() or 1, frames)
+        run = _run_here if workers == 1 else _run_in_processes
+        gains, coverage = run(plan, partial, workers, progress or (lambda done, total: None))
+        _write_lists(plan, partial, gains)
+        _write_objects(plan, partial)
+    return RecordingSummary(
+        folder=str(folder),
+        scenario=scenario,
+        seed=seed,
+        frames=frames,
+        duration_s=frames / rate_hz,
+        mean_coverage=float(np.mean(coverage)),
+        max_coverage=float(np.max(coverage)),
+    )
+
+
+def _metered(plan: RecordingPlan) -> list[int]:
+    return sorted({*range(0, plan.frames, _METER_EVERY), plan.frames - 1})
+
+
+def _gains(plan: RecordingPlan, brightness: Sequence[float]) -> list[float]:
+    every = np.interp(np.arange(plan.frames), _metered(plan), brightness)
+    return [float(g) for g in auto_exposure(every, 1 / plan.rate_hz, ColorSensor())]
+
+
+def _run_here(
+    plan: RecordingPlan, folder: Path, workers: int, progress: Progress
+) -> tuple[list[float], list[float]]:
+    worker = FrameWorker(plan, folder)
+    gains = _gains(plan, [worker.brightness(frame) for frame in _metered(plan)])
+    coverage = []
+    for frame, gain in enumerate(gains):
+        coverage.append(worker.write(frame, gain))
+        progress(frame + 1, plan.frames)
+    return gains, coverage
+
+
+def _run_in_processes(
+    plan: RecordingPlan, folder: Path, workers: int, progress: Progress
+) -> tuple[list[float], list[float]]:
+    context = multiprocessing.get_context('spawn')
+    pool = ProcessPoolExecutor(workers, context, initializer=_start, initargs=(plan, folder))
+    try:
+        gains = _gains(plan, list(pool.map(_brightness, _metered(plan), chunksize=4)))
+        coverage = []
+        for done in pool.map(_write, range(plan.frames), gains):
+            coverage.append(done)
+            progress(len(coverage), plan.frames)
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+    return gains, coverage
+
+
+def _check_target(folder: Path, force: bool) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise DatasetError(f"'{folder}' is a file; name a folder that is new or empty")
+    if not folder.is_dir() or not any(folder.iterdir()):
+        return
+    if not force:
+        raise DatasetError(f"'{folder}' is not empty; choose another folder or use --force")
+    if not SynthTruth.available(folder):
+        raise DatasetError(
+            f"'{folder}' is not empty and not a synthetic recording, so it is not replaced; "
+            'choose another folder or empty it yourself'
+        )
+
+
+@contextmanager
+def _set_aside(folder: Path) -> Iterator[Path]:
+    """Yield a folder beside the target that takes its place at the end, or leaves no trace."""
+    folder = folder.absolute()
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    partial = folder.with_name(f'.{folder.name}.partial-{os.getpid()}')
+    partial.mkdir()
+    try:
+        yield partial
+        _replace(folder, partial)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _replace(folder: Path, partial: Path) -> None:
+    if not folder.exists():
+        partial.rename(folder)
+        return
+    old = folder.with_name(f'.{folder.name}.old-{os.getpid()}')
+    folder.rename(old)
+    partial.rename(folder)
+    shutil.rmtree(old)
+
+
+def _pose_row(stamp_ns: int, T: NDArray[np.float64]) -> str:
+    position, quat = se3.to_position_quat_xyzw(T)
+    return ' '.join([stamp_text(stamp_ns), *(f'{v:.9f}' for v in (*position, *quat))])
+
+
+def _write_lists(plan: RecordingPlan, folder: Path, gains: Sequence[float]) -> None:
+    stamps = [plan.stamp_ns(k) for k in range(plan.frames)]
+    for kind, title in (('rgb', 'color images'), ('depth', 'depth maps')):
+        rows = [f'{stamp_text(s)} {kind}/{stamp_text(s)}.png' for s in stamps]
+        _write_text(folder / f'{kind}.txt', [f'# {title}', '# timestamp filename', *rows])
+    path = plan.world().camera_path
+    poses = [_pose_row(s, path.pose(plan.time_s(k))) for k, s in enumerate(stamps)]
+    header = ['# ground truth trajectory', '# timestamp tx ty tz qx qy qz qw']
+    for name in ('groundtruth.txt', 'truth/groundtruth.txt'):
+        _write_text(folder / name, header + poses)
+    rows = [f'{stamp_text(s)} {g:.6f}' for s, g in zip(stamps, gains, strict=True)]
+    _write_text(folder / 'truth/exposure.txt', ['# timestamp gain', *rows])
+    _write_text(folder / 'camera.yaml', _camera_yaml(plan.camera))
+
+
+def _camera_yaml(camera: PinholeCamera) -> list[str]:
+    rows = [(key, getattr(camera, key)) for key in ('width', 'height', 'fx', 'fy', 'cx', 'cy')]
+    return [
+        'camera:',
+        '  name: synth',
+        *(f'  {key}: {value!r}' for key, value in rows),
+        f'  distortion: {list(camera.distortion)}',
+        f'  depth_scale: {DEPTH_SCALE}',
+    ]
+
+
+def _write_text(path: Path, lines: Sequence[str]) -> None:
+    path.write_text('\n'.join(lines) + '\n')
+
+
+def _write_objects(plan: RecordingPlan, folder: Path) -> None:
+    objects = plan.world().scene.objects
+    content = {
+        'scenario': plan.scenario,
+        'seed': plan.seed,
+        'frames': plan.frames,
+        'size': [plan.width, plan.height],
+        'rate_hz': plan.rate_hz,
+        'objects': [_describe(item, plan) for item in objects],
+    }
+    (folder / 'truth/objects.json').write_text(json.dumps(content, indent=1) + '\n')
+
+
+def _describe(item: SceneObject, plan: RecordingPlan) -> dict[str, Any]:
+    ends = (0.0, plan.time_s(plan.frames - 1))
+    start = _FIRST_STAMP_NS * 1e-9
+    frames = range(plan.frames) if item.is_mover else ()
+    return {
+        'id': item.object_id,
+        'name': item.name,
+        'kind': item.kind,
+        'is_mover': item.is_mover,
+        'moving_s': [
+            [start + float(np.clip(t, *ends)) for t in interval] for interval in item.moving
+        ],
+        'poses': [
+            _pose_row(plan.stamp_ns(k), item.T_world_object(plan.time_s(k))) for k in frames
+        ],
+    }
