@@ -61,7 +61,7 @@ def rescore(
     from bdgs_ros.data.layouts import open_sequence
     from bdgs_ros.mapping.mapper import Mapper
 
-    known = _known_metrics(folder / 'metrics.json')
+    known = _known_results(folder / 'metrics.json')
     sequence = open_sequence(recording, camera_file)
     est = read_trajectory(folder / 'trajectory.txt')
     mapper = Mapper(config.mapping, config.belief)
@@ -79,16 +79,20 @@ def rescore(
         config=config,
         save_map=False,
     )
-    metrics['metrics'] = {**metrics['metrics'], **known}
+    figures = {**metrics['metrics'], **known.get('metrics', {})}
+    metrics = {**metrics, **known, 'metrics': figures, 'notes': metrics['notes']}
     write_text(folder / 'metrics.json', dump_json(metrics) + '\n')
     return metrics
 
 
-def _known_metrics(path: Path) -> Mapping[str, Any]:
-    """Return the figures that a run wrote itself; none if there is no such file."""
+def _known_results(path: Path) -> dict[str, Any]:
+    """Return what the run wrote itself; nothing if there is no such file."""
     if not path.is_file():
         return {}
-    found = json.loads(path.read_text(encoding='utf-8')).get('metrics', {})
+    try:
+        found = json.loads(path.read_text(encoding='utf-8'))
+    except ValueError as error:
+        raise EvaluationError(f"'{path}' is not JSON: {error}") from error
     return found if isinstance(found, dict) else {}
 
 

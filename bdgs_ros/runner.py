@@ -19,7 +19,7 @@ from bdgs_ros.core.errors import EvaluationError
 from bdgs_ros.core.types import RgbdFrame, TrackingResult, Trajectory
 from bdgs_ros.data.trajectory_io import write_trajectory
 from bdgs_ros.eval import pictures, plots, provenance, scores, trajectory
-from bdgs_ros.eval.files import write_aside, write_text
+from bdgs_ros.eval.files import write_text
 from bdgs_ros.eval.labels import LabelScore, score_labels
 from bdgs_ros.eval.metric import Metric, as_dict, dump_json
 from bdgs_ros.eval.recorder import Recorder, RunResult
@@ -206,7 +206,7 @@ def write_results(
     views: list[scores.View] = []
     if static_map is not None:
         if save_map:
-            write_aside(folder / 'map.ply', static_map.save)
+            static_map.save(folder / 'map.ply')
         found += map_metrics(folder / 'map.ply')
         views = scores.render_samples(result.samples, static_map)
         found += scores.render_metrics(views, truth)

@@ -91,17 +91,8 @@ def _draw_error(axes: Any, ate: AteResult) -> None:
     rmse_cm = 100.0 * ate.statistics.rmse
     axes.plot(seconds, 100.0 * ate.errors_m, color=_ESTIMATE, lw=1.4)
     axes.axhline(rmse_cm, color=_TRUTH, lw=1.0, ls='--')
-    axes.annotate(
-        f'RMSE {rmse_cm:.2f} cm',
-        (seconds[-1], rmse_cm),
-        textcoords='offset points',
-        xytext=(-2, 4),
-        ha='right',
-        color=_INK,
-        fontsize=9,
-        bbox={'facecolor': 'white', 'alpha': 0.8, 'edgecolor': 'none', 'pad': 1.0},
-    )
-    axes.set(xlabel='time [s]', ylabel='error [cm]', title='error of every frame', ylim=(0, None))
+    title = f'error of every frame; dashed: RMSE {rmse_cm:.2f} cm'
+    axes.set(xlabel='time [s]', ylabel='error [cm]', title=title, ylim=(0, None))
     _tidy(axes)
 
 
