@@ -18,6 +18,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
 
 from bdgs_ros.core.errors import DatasetError
+from bdgs_ros.data.bag_cursor import BagCursor, MessageKey, RawMessage
 from bdgs_ros.data.mcap_index import CannotIndexError, Entry, McapIndex
 from bdgs_ros.data.mcap_salvage import SalvagedMcap
 from bdgs_ros.data.messages import jazzy
@@ -33,16 +34,6 @@ class TopicInfo(NamedTuple):
 
     msgtype: str
     count: int  # type: ignore[assignment]  # hides tuple.count, which nobody misses
-
-
-class RawMessage(NamedTuple):
-    """One message as it is stored."""
-
-    topic: str
-    msgtype: str
-    stamp_ns: int
-    """When it was logged; in bags made by `bdgs convert` this is the header's stamp."""
-    data: bytes
 
 
 class MessageRef(NamedTuple):
@@ -122,6 +113,8 @@ class BagReader:
         self.path = path
         self.truncated = False
         self._fast: McapIndex | None = None
+        self._cursor: BagCursor | None = None
+        self._indexed: set[str] = set()
         self._reader = self._open(allow_truncated)
         self.topics = {
             name: TopicInfo(info.msgtype or 'several types', info.msgcount)
@@ -286,13 +279,9 @@ class BagReader:
         for raw in self.raw_messages(topics):
             yield raw, self.deserialize(raw.data, raw.msgtype)
 
-    @property
-    def has_random_access(self) -> bool:
-        """Whether `read` costs no more than the message; else prefer one pass."""
-        return self._fast is not None
-
     def index(self, topics: Collection[str]) -> dict[str, list[MessageRef]]:
         """Return where the messages of some topics are, each topic in order of header stamps."""
+        self._indexed |= set(topics)
         self._connections(topics)
         refs = self._fast_index(topics) or self._slow_index(topics)
         return {topic: sorted(refs[topic], key=lambda ref: ref.stamp_ns) for topic in topics}
@@ -315,14 +304,18 @@ class BagReader:
         return refs
 
     def read(self, topic: str, ref: MessageRef) -> bytes:
-        """Read one message again."""
+        """Read one message again; nearly in order is quick in every storage."""
         if self._fast is not None and ref.entry is not None:
             return self._fast.read(ref.entry)
-        found = self._messages(self._connections([topic]), ref.log_ns, ref.log_ns + 1)
-        for nth, raw in enumerate(found):
-            if nth == ref.nth:
-                return raw.data
-        raise DatasetError(f"'{self.path}': message of '{topic}' at {ref.log_ns} ns has gone")
+        key = MessageKey(topic, ref.log_ns, ref.nth)
+        data = None if self._cursor is None else self._cursor.find(key)
+        if data is None:
+            connections = self._connections({topic} | self._indexed)
+            self._cursor = BagCursor(self._messages(connections, ref.log_ns, self.end_ns + 1))
+            data = self._cursor.find(key)
+        if data is None:
+            raise DatasetError(f"'{self.path}': message of '{topic}' at {ref.log_ns} ns has gone")
+        return data
 
 
 def _refs_from_mcap(index: McapIndex, topic: str) -> list[MessageRef]:

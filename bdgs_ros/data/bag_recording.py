@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -198,47 +198,6 @@ class BagRecording:
                 f"topic '{topic}': expected images of shape {self.camera.shape} as in "
                 f"'{self.layout.info}', received {shape}; depth must be registered to colour"
             )
-
-    def read_pairs(self, pairs: list[tuple[int, int]]) -> Iterator[tuple[ColorImage, DepthImage]]:
-        """Read many pairs in the order given: one by one if that is cheap, else in one pass."""
-        if self.reader.has_random_access:
-            for color, depth in pairs:
-                yield self.read_color(color), self.read_depth(depth)
-        else:
-            yield from self._stream_pairs(pairs)
-
-    def _stream_pairs(
-        self, pairs: list[tuple[int, int]]
-    ) -> Iterator[tuple[ColorImage, DepthImage]]:
-        keys = [
-            (_key(self.layout.color, self._color[i]), _key(self.layout.depth, self._depth[j]))
-            for i, j in pairs
-        ]
-        wanted = {key for pair in keys for key in pair}
-        held: dict[_Key, bytes] = {}
-        incoming = self._keyed_messages()
-        for color_key, depth_key in keys:
-            while color_key not in held or depth_key not in held:
-                key, data = next(incoming)
-                if key in wanted:
-                    held[key] = data
-            yield self._to_color(held.pop(color_key)), self._to_depth(held.pop(depth_key))
-
-    def _keyed_messages(self) -> Iterator[tuple[_Key, bytes]]:
-        last: dict[str, _Key] = {}
-        for raw in self.reader.raw_messages([self.layout.color, self.layout.depth]):
-            before = last.get(raw.topic)
-            again = before is not None and before[1] == raw.stamp_ns
-            nth = before[2] + 1 if before is not None and again else 0
-            last[raw.topic] = (raw.topic, raw.stamp_ns, nth)
-            yield last[raw.topic], raw.data
-
-
-_Key = tuple[str, int, int]
-
-
-def _key(topic: str, ref: MessageRef) -> _Key:
-    return topic, ref.log_ns, ref.nth
 
 
 def _stamps(refs: list[MessageRef]) -> NDArray[np.int64]:

@@ -57,9 +57,6 @@ class Recording(Protocol):
     def read_depth(self, index: int) -> DepthImage:
         """Read one depth image in metres, distorted; 0 = invalid."""
 
-    def read_pairs(self, pairs: list[tuple[int, int]]) -> Iterator[tuple[ColorImage, DepthImage]]:
-        """Read many pairs in the order given, in one pass where the format allows it."""
-
 
 class Sequence(Protocol):
     """Rectified RGB-D frames in order of time."""
@@ -172,22 +169,13 @@ class RecordedSequence:
     def __getitem__(self, index: int) -> RgbdFrame:
         """Read one frame; negative indices count from the end."""
         color, depth = self._pairs[index]
-        return self._frame(
+        return RgbdFrame(
             int(self.stamps_ns[index]),
-            self.recording.read_color(color),
-            self.recording.read_depth(depth),
+            self._rectifier.color(self.recording.read_color(color)),
+            self._rectifier.depth(self.recording.read_depth(depth)),
+            self._rectifier.camera,
         )
 
     def __iter__(self) -> Iterator[RgbdFrame]:
-        """Read all frames in order, in one pass."""
-        images = self.recording.read_pairs(self._pairs)
-        for stamp_ns, (color, depth_m) in zip(self.stamps_ns, images, strict=True):
-            yield self._frame(int(stamp_ns), color, depth_m)
-
-    def _frame(self, stamp_ns: int, color: ColorImage, depth_m: DepthImage) -> RgbdFrame:
-        return RgbdFrame(
-            stamp_ns,
-            self._rectifier.color(color),
-            self._rectifier.depth(depth_m),
-            self._rectifier.camera,
-        )
+        """Read all frames in order."""
+        return (self[index] for index in range(len(self)))

@@ -7,7 +7,6 @@ Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -160,11 +159,6 @@ class FolderRecording:
         image = read_depth_file(self._depth[index].path, self._depth_scale)
         self._check_size(self._depth[index].path, image.shape)
         return image
-
-    def read_pairs(self, pairs: list[tuple[int, int]]) -> Iterator[tuple[ColorImage, DepthImage]]:
-        """Read many pairs in the order given."""
-        for color, depth in pairs:
-            yield self.read_color(color), self.read_depth(depth)
 
     def _check_size(self, path: Path, shape: tuple[int, ...]) -> None:
         if shape != self.camera.shape:

@@ -374,3 +374,31 @@ def test_header_stamps_of_ros1_and_of_both_byte_orders() -> None:
     assert header_stamp_ns(little) == header_stamp_ns(big) == 7 * 10**9 + 9
     ros1 = (65536).to_bytes(4, 'little') + little[4:]
     assert header_stamp_ns(ros1, ros1=True) == 7 * 10**9 + 9
+
+
+# ---- reading here and there
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_messages_are_found_in_any_order(tmp_path: Path, storage: str) -> None:
+    plugins = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
+    writer = Writer(tmp_path / 'bag', version=9, storage_plugin=plugins[storage])
+    stamps = [0, 5, 5, 5, 10, 2 * 10**9, 2 * 10**9, 9 * 10**9]  # as logged; headers run on
+    with writer:
+        connections = [
+            writer.add_connection(topic, messages.POSE_STAMPED, typestore=messages.jazzy())
+            for topic in ('/a', '/b')
+        ]
+        for index, log_ns in enumerate(stamps):
+            for connection in connections:
+                data = messages.serialize_pose(100 + index, connection.topic, pose(index))
+                writer.write(connection, log_ns, data)
+    with open_bag(tmp_path / 'bag') as reader:
+        refs = reader.index(['/a', '/b'])
+        assert [ref.stamp_ns for ref in refs['/a']] == list(range(100, 108))
+        assert [ref.nth for ref in refs['/a']] == [0, 0, 1, 2, 0, 0, 1, 0]
+        places = [(topic, index) for topic in refs for index in range(len(stamps))]
+        for place in np.random.default_rng(5).integers(0, len(places), 200):
+            topic, index = places[place]
+            expected = messages.serialize_pose(100 + index, topic, pose(index))
+            assert reader.read(topic, refs[topic][index]) == expected
