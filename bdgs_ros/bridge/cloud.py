@@ -30,10 +30,21 @@ _DTYPE = np.dtype(
 class Gaussians(Protocol):
     """What the cloud needs of a map."""
 
-    means: NDArray[np.float32]
-    colors: NDArray[np.float32]
-    log_scales: NDArray[np.float32]
-    logit_opacities: NDArray[np.float32]
+    @property
+    def means(self) -> NDArray[np.float32]:
+        """Positions in metres, shape (N, 3)."""
+
+    @property
+    def colors(self) -> NDArray[np.float32]:
+        """RGB in [0, 1], shape (N, 3)."""
+
+    @property
+    def log_scales(self) -> NDArray[np.float32]:
+        """Natural logarithm of metres, shape (N, 3)."""
+
+    @property
+    def logit_opacities(self) -> NDArray[np.float32]:
+        """Shape (N,)."""
 
     @property
     def p_dynamic(self) -> NDArray[np.float32]:
@@ -80,19 +91,18 @@ def cloud_from_map(gaussians: Gaussians, margin: float, head: Header) -> PointCl
 def _pack(colors: NDArray[np.float32]) -> NDArray[np.float32]:
     levels = np.clip(colors * 255 + 0.5, 0, 255).astype(np.uint32)
     packed = levels[:, 0] << 16 | levels[:, 1] << 8 | levels[:, 2]
-    return packed.astype(np.uint32).view(np.float32)
+    return np.asarray(packed.astype(np.uint32).view(np.float32))
 
 
 def _message(points: NDArray[np.void], head: Header) -> PointCloud2:
-    names = _DTYPE.names or ()
     fields = [
         PointField(
             name=name,
-            offset=_DTYPE.fields[name][1],
+            offset=entry[1],
             datatype=PointField.UINT8 if name == 'label' else PointField.FLOAT32,
             count=1,
         )
-        for name in names
+        for name, entry in (_DTYPE.fields or {}).items()
     ]
     cloud = PointCloud2(
         header=head,

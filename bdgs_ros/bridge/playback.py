@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from bdgs_ros.bridge.node_config import ReplayConfig
 from bdgs_ros.bridge.synchroniser import Patience, SyncCounts, Synchroniser
 from bdgs_ros.core.errors import DatasetError
-from bdgs_ros.data.bag import BagReader, RawMessage, header_stamp_ns
+from bdgs_ros.data.bag import BagReader, header_stamp_ns
+from bdgs_ros.data.bag_cursor import RawMessage
 from bdgs_ros.data.bag_recording import INFO_TOPIC, TopicLayout, recognise
 from bdgs_ros.data.trajectory_io import seconds_to_ns
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
@@ -12,7 +11,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 
 from bdgs_ros.bridge import topics
-from bdgs_ros.data.bag import RawMessage
+from bdgs_ros.data.bag_cursor import RawMessage
 from bdgs_ros.data.bag_recording import TopicLayout
 
 
@@ -75,11 +74,9 @@ class RawPublishers:
 
     def subscribers(self) -> int:
         """Return how many subscribers every camera topic has at least."""
-        return min(publisher.get_subscription_count() for publisher in self._camera)
+        return min(int(publisher.get_subscription_count()) for publisher in self._camera)
 
     def wait_delivered(self, timeout_s: float) -> None:
         """Wait until reliable subscribers have everything."""
-        wait: Callable[[Duration], bool]
         for publisher in self._camera:
-            wait = publisher.wait_for_all_acked
-            wait(Duration(seconds=timeout_s))
+            publisher.wait_for_all_acked(Duration(seconds=timeout_s))

@@ -20,7 +20,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 Left = TypeVar('Left')
 Right = TypeVar('Right')
@@ -149,7 +149,9 @@ class Synchroniser(Generic[Left, Right]):
         self._left.restart()
         self._right.restart()
 
-    def _accept(self, stream: _Stream[Item], other: _Stream[object], stamp_ns: int) -> bool:
+    def _accept(self, stream: _Stream[Item], other: _Stream[Any], stamp_ns: int) -> bool:
+        if stream.jump_pending:
+            return self._accept_after_jump(stream, other, stamp_ns)
         newest = stream.newest_ns
         if newest is None or stamp_ns > newest:
             return True
@@ -159,14 +161,21 @@ class Synchroniser(Generic[Left, Right]):
             else:
                 self.counts.out_of_order += 1
             return False
-        if stream.jump_pending:  # the other stream has jumped before: one event, not two
-            stream.restart()
-            return True
         stream.restart()
         other.items.clear()
         other.jump_pending = True
         self.counts.jumps += 1
         self._on_jump()
+        return True
+
+    def _accept_after_jump(
+        self, stream: _Stream[Item], other: _Stream[Any], stamp_ns: int
+    ) -> bool:
+        """Drop what comes late from before the jump of the other stream, then follow it."""
+        if other.newest_ns is not None and stamp_ns - other.newest_ns > self._jump_back_ns:
+            self.counts.out_of_order += 1
+            return False
+        stream.restart()
         return True
 
     def _take_pairs(self) -> list[tuple[Left, Right]]:
@@ -229,7 +238,7 @@ class Synchroniser(Generic[Left, Right]):
         self.counts.unpaired_left += self._trim(self._left, self._right)
         self.counts.unpaired_right += self._trim(self._right, self._left)
 
-    def _trim(self, stream: _Stream[Item], other: _Stream[object]) -> int:
+    def _trim(self, stream: _Stream[Item], other: _Stream[Any]) -> int:
         dropped = 0
         while stream.items and (
             len(stream.items) > self._capacity or self._is_hopeless(stream.items[0][0], other)
@@ -238,7 +247,7 @@ class Synchroniser(Generic[Left, Right]):
             dropped += 1
         return dropped
 
-    def _is_hopeless(self, stamp_ns: int, other: _Stream[object]) -> bool:
+    def _is_hopeless(self, stamp_ns: int, other: _Stream[Any]) -> bool:
         if other.newest_ns is None or other.newest_ns <= stamp_ns + self._tolerance_ns:
             return False
         return not any(abs(ns - stamp_ns) <= self._tolerance_ns for ns, _ in other.items)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.parameter import Parameter
@@ -27,7 +27,7 @@ class InProcessNodes:
         self._nodes: list[GraphNode] = []
         self._stopping = False
 
-    def start(self, kind: type[GraphNode], values: Mapping[str, object]) -> None:
+    def start(self, kind: Callable[..., GraphNode], values: Mapping[str, object]) -> None:
         """Make a node and spin it."""
         node = kind(
             parameter_overrides=[Parameter(name, value=value) for name, value in values.items()],

@@ -21,7 +21,8 @@ from bdgs_ros.bridge.runner import REFUSED, GraphNode, run
 from bdgs_ros.bridge.services import serve_switch, serve_trigger
 from bdgs_ros.bridge.status import status_from_message
 from bdgs_ros.core.errors import BdgsError, ConfigError
-from bdgs_ros.data.bag import RawMessage, open_bag
+from bdgs_ros.data.bag import open_bag
+from bdgs_ros.data.bag_cursor import RawMessage
 
 _POLL_S = 0.05
 _SETTLE_S = 0.5

@@ -57,10 +57,10 @@ class TrackingNode(GraphNode):
             frame = None if self._paused else self._decoder.decode(raw)
         except DatasetError as error:
             self._health.set_problem('frame', str(error))
-            self._finish(raw, FrameState.SKIPPED)
+            self._finish(raw, FrameStatus(raw.stamp_ns, FrameState.SKIPPED))
             return
         if frame is None:
-            self._finish(raw, FrameState.PAUSED)
+            self._finish(raw, FrameStatus(raw.stamp_ns, FrameState.PAUSED))
             return
         self._health.mark('frame', '')
         self._track(raw, frame)
@@ -88,8 +88,8 @@ class TrackingNode(GraphNode):
         self._health.add_timing('image_to_pose', latency_ms)
         self._health.counts['keyframes'] += result.is_keyframe
         self._health.set_problem('lost', 'LOST: no pose is published' if lost else '')
-        self._finish(
-            raw,
+        status = FrameStatus(
+            raw.stamp_ns,
             FrameState.LOST if lost else FrameState.OK,
             result.is_keyframe,
             result.inlier_ratio,
@@ -97,12 +97,12 @@ class TrackingNode(GraphNode):
             tracking_ms,
             latency_ms,
         )
+        self._finish(raw, status)
 
-    def _finish(self, raw: RawFrame, state: FrameState, *values: float) -> None:
+    def _finish(self, raw: RawFrame, status: FrameStatus) -> None:
         """Acknowledge an image, whatever became of it."""
-        self._health.counts[f'frames_{state.value}'] += 1
+        self._health.counts[f'frames_{status.state.value}'] += 1
         self._health.counts['frames_dropped'] = self._worker.dropped
-        status = FrameStatus(raw.stamp_ns, state, *values)
         self._status.publish(status_to_message(status, raw.color.header.frame_id))
 
     def _on_error(self, error: Exception) -> None:

@@ -1,0 +1,121 @@
+"""The worker, the buffers by stamp, and the count of acknowledgements."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+from bdgs_ros.bridge.acknowledgements import Acknowledgements
+from bdgs_ros.bridge.stamped import Assembler, StampBuffer
+from bdgs_ros.bridge.worker import Worker
+
+
+def test_worker_drops_the_oldest_and_counts() -> None:
+    gate, seen = threading.Event(), []
+
+    def handle(item: int) -> None:
+        gate.wait(2.0)
+        seen.append(item)
+
+    worker: Worker[int] = Worker(handle, lambda error: None, capacity=2)
+    worker.put(0)
+    while not worker._busy:
+        time.sleep(0.001)
+    for item in (1, 2, 3, 4):
+        worker.put(item)
+    gate.set()
+    assert worker.wait_idle(2.0)
+    assert seen == [0, 3, 4]
+    assert worker.dropped == 2
+    worker.stop()
+
+
+def test_worker_survives_an_error() -> None:
+    errors: list[Exception] = []
+    seen: list[int] = []
+
+    def handle(item: int) -> None:
+        if item == 1:
+            raise ValueError('one')
+        seen.append(item)
+
+    worker: Worker[int] = Worker(handle, errors.append, capacity=None)
+    for item in range(3):
+        worker.put(item)
+    assert worker.wait_idle(2.0)
+    assert seen == [0, 2]
+    assert [str(e) for e in errors] == ['one']
+    worker.stop()
+
+
+def test_worker_restart_comes_before_newer_items() -> None:
+    gate, seen = threading.Event(), []
+
+    def handle(item: str) -> None:
+        gate.wait(2.0)
+        seen.append(item)
+
+    worker: Worker[str] = Worker(handle, lambda error: None, capacity=None)
+    worker.put('old')
+    while not worker._busy:
+        time.sleep(0.001)
+    worker.put('forgotten')
+    worker.restart(lambda: seen.append('restart'))
+    worker.put('new')
+    gate.set()
+    assert worker.wait_idle(2.0)
+    assert seen == ['old', 'restart', 'new']
+    worker.stop()
+
+
+def test_worker_idles() -> None:
+    calls: list[int] = []
+    worker: Worker[int] = Worker(
+        lambda item: None, lambda error: None, None, lambda: calls.append(1), 0.01
+    )
+    time.sleep(0.2)
+    worker.stop()
+    assert len(calls) >= 3
+
+
+def test_stamp_buffer_waits_across_threads() -> None:
+    buffer: StampBuffer[str] = StampBuffer(2)
+    threading.Timer(0.05, buffer.put, (7, 'seven')).start()
+    assert buffer.wait(7, 2.0) == 'seven'
+    assert buffer.wait(8, 0.01) is None
+
+
+def test_stamp_buffer_finds_the_newest_within_an_age() -> None:
+    buffer: StampBuffer[int] = StampBuffer(3)
+    for stamp in (10, 20, 30, 40):
+        buffer.put(stamp, stamp)
+    assert buffer.newest(35, 10) == 30
+    assert buffer.newest(19, 10) is None  # 10 was forgotten
+    assert buffer.newest(29, 5) is None
+    assert buffer.take_newest() == 40
+    assert buffer.take_newest() is None
+
+
+def test_assembler_gives_complete_sets_and_forgets_old_ones() -> None:
+    assembler: Assembler[int] = Assembler(('a', 'b'), capacity=2)
+    assert assembler.add(1, 'a', 10) is None
+    assert assembler.add(1, 'b', 20) == {'a': 10, 'b': 20}
+    for stamp in (2, 3, 4):
+        assembler.add(stamp, 'a', stamp)
+    assert assembler.add(2, 'b', 0) is None
+    assert assembler.add(4, 'b', 0) == {'a': 4, 'b': 0}
+
+
+def test_acknowledgements_count_what_is_missed() -> None:
+    acks = Acknowledgements()
+    now = time.perf_counter()
+    acks.arrived(1, 'ok')  # before it was known to be a frame
+    acks.expect(1, now)
+    acks.expect(2, now)
+    acks.expect(3, now)
+    acks.arrived(2, 'lost')
+    acks.arrived(2, 'lost')
+    acks.arrived(99, 'ok')
+    assert (acks.sent, acks.missed, dict(acks.states)) == (3, 1, {'ok': 1, 'lost': 1})
+    assert acks.wait(2, 0.0)
+    assert not acks.wait(3, 0.01)
