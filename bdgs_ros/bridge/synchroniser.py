@@ -248,7 +248,9 @@ class Synchroniser(Generic[Left, Right]):
         return dropped
 
     def _is_hopeless(self, stamp_ns: int, other: _Stream[Any]) -> bool:
-        if other.newest_ns is None or other.newest_ns <= stamp_ns + self._tolerance_ns:
+        if other.newest_ns is None or other.jump_pending:
+            return False
+        if other.newest_ns <= stamp_ns + self._tolerance_ns:
             return False
         return not any(abs(ns - stamp_ns) <= self._tolerance_ns for ns, _ in other.items)
 
