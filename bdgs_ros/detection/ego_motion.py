@@ -1,14 +1,21 @@
-"""Where the camera went over the last second: what the geometric prior needs to compare frames."""
+"""Where the camera went over the last seconds: what the geometric prior needs to compare frames."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+
+from bdgs_ros.core import se3
+from bdgs_ros.core.config.detection import GeometricConfig
+from bdgs_ros.core.config.tracking import AlignConfig
 from bdgs_ros.core.types import Pose, ProbabilityImage, RgbdFrame
+from bdgs_ros.tracking.align import Aligner, ImagePyramid
 
 
 class EgoMotion(Protocol):
-    """Camera poses that are right relative to each other over a second or so."""
+    """Camera poses that are right relative to each other over a few seconds."""
 
     def update(self, frame: RgbdFrame, p_dynamic: ProbabilityImage) -> Pose | None:
         """
@@ -19,3 +26,82 @@ class EgoMotion(Protocol):
 
     def reset(self) -> None:
         """Start anew."""
+
+
+@dataclass(frozen=True)
+class _Anchor:
+    stamp_ns: int
+    T_odom_camera: Pose
+    pyramid: ImagePyramid
+
+
+_MIN_COVERAGE = 0.04  # less static image compared: a pose from it is chance
+_MIN_OVERLAP = 0.8  # less of the anchor in view: the next frames get a new one
+_MAX_MISSES = 5  # frames at constant velocity before the motion is unknown
+
+
+class DirectEgoMotion:
+    """
+    Coarse direct alignment to an anchor frame, at constant velocity between frames.
+
+    The stage has its own small odometry, so that it runs in its own process without waiting for
+    the tracker (which waits for it).
+
+    Parameters
+    ----------
+    config : GeometricConfig
+        `width` is the finest image that is aligned.
+
+    """
+
+    def __init__(self, config: GeometricConfig) -> None:
+        self._config = config
+        self._aligner = Aligner(AlignConfig(fine_width=config.width))
+        self.reset()
+
+    def reset(self) -> None:
+        """Start anew."""
+        self._anchor: _Anchor | None = None
+        self._T_odom_camera = se3.identity()
+        self._misses = 0
+        self._step = se3.identity()  # T_last_current of the last pair of frames
+
+    def update(self, frame: RgbdFrame, p_dynamic: ProbabilityImage) -> Pose | None:
+        """
+        Return `T_odom_camera` of the next frame, or None when it cannot be aligned.
+
+        Parameters
+        ----------
+        frame : RgbdFrame
+            Newer than the last.
+        p_dynamic : ndarray, shape (H, W), uint8
+            What is known to move and is left out.
+
+        """
+        current = self._aligner.pyramid(frame.color, frame.depth_m, p_dynamic, frame.camera)
+        if self._anchor is None:
+            self._anchor = _Anchor(frame.stamp_ns, self._T_odom_camera, current)
+            return self._T_odom_camera
+        guess = self._T_odom_camera @ self._step
+        result = self._aligner.align(
+            self._anchor.pyramid, current, se3.inverse(guess) @ self._anchor.T_odom_camera
+        )
+        if result.inlier_ratio < self._config.min_inliers or result.coverage < _MIN_COVERAGE:
+            return self._coast(guess)
+        self._misses = 0
+        pose = self._anchor.T_odom_camera @ se3.inverse(result.T_current_reference)
+        self._step = se3.inverse(self._T_odom_camera) @ pose
+        self._T_odom_camera = se3.orthonormalise(pose)
+        age_s = (frame.stamp_ns - self._anchor.stamp_ns) * 1e-9
+        if age_s > self._config.lag or result.overlap < _MIN_OVERLAP:
+            self._anchor = _Anchor(frame.stamp_ns, self._T_odom_camera, current)
+        return self._T_odom_camera
+
+    def _coast(self, guess: Pose) -> Pose | None:
+        """Believe the constant velocity for a few frames, then give up."""
+        self._misses += 1
+        if self._misses > _MAX_MISSES:
+            self.reset()
+            return None
+        self._T_odom_camera = se3.orthonormalise(guess)
+        return self._T_odom_camera

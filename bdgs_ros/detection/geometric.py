@@ -11,9 +11,9 @@ map's own residuals are for that.
 
 from __future__ import annotations
 
-import logging
 from collections import deque
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,12 +22,11 @@ from numpy.typing import NDArray
 from bdgs_ros.core import se3
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.config.detection import GeometricConfig
-from bdgs_ros.core.types import DepthImage, Pose, ProbabilityImage, RgbdFrame
+from bdgs_ros.core.images import Mask, opened, without_specks
+from bdgs_ros.core.types import DYNAMIC_THRESHOLD, DepthImage, Pose, ProbabilityImage, RgbdFrame
+from bdgs_ros.detection.depth_align import InverseDepth, align_depth
 from bdgs_ros.detection.ego_motion import EgoMotion
 
-_LOG = logging.getLogger(__name__)
-
-Mask = NDArray[np.uint8]  # 0 or 1
 _SECOND_NS = 1_000_000_000
 _KERNEL = np.ones((3, 3), np.uint8)
 
@@ -38,8 +37,11 @@ class View:
 
     stamp_ns: int
     T_odom_camera: Pose
+    way: NDArray[np.float64]
+    """Metres moved and radians turned since the start, whatever the direction."""
     free_m: DepthImage
     """Shape (h, w): how far each viewing ray was certainly free; 0 = unknown."""
+    inverse_depth: InverseDepth
 
 
 def free_depth(depth_m: DepthImage, radius: int) -> DepthImage:
@@ -110,7 +112,6 @@ class GeometricPrior:
         self._lags_ns = [int(config.lag * 2**k * _SECOND_NS) for k in range(config.lags)]
         self._views: deque[View] = deque()
         self._last: Mask | None = None
-        self._disbelieved = 0
 
     def reset(self) -> None:
         """Forget all earlier frames."""
@@ -130,52 +131,70 @@ class GeometricPrior:
             What is known to move already: the ego-motion is told to leave it out.
 
         """
-        moving = self._with_last(prior)
-        ego = self._ego.update(frame, moving)
-        camera = frame.camera.scaled(self._config.width / frame.camera.width)
-        depth_m = cv2.resize(
-            frame.depth_m, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST
-        )
-        if ego is None:
+        told = self._with_last(prior)
+        T_odom_camera = self._ego.update(frame, told)
+        if T_odom_camera is None:
             self._views.clear()
             self._last = None
             return np.zeros(frame.depth_m.shape, np.uint8)
-        mask = self._movers(frame.stamp_ns, np.asarray(depth_m), ego, camera)
-        self._remember(View(frame.stamp_ns, ego, free_depth(np.asarray(depth_m), 2)))
-        self._last = mask
-        return self._paint(mask, frame.depth_m.shape)
+        camera = frame.camera.scaled(self._config.width / frame.camera.width)
+        depth_m = _shrink(frame.depth_m, camera)
+        moving = _shrink(told, camera) >= DYNAMIC_THRESHOLD
+        still_m = np.where(moving, np.float32(0), depth_m)
+        now = View(
+            frame.stamp_ns,
+            T_odom_camera,
+            self._way_to(T_odom_camera),
+            free_depth(depth_m, 2),
+            InverseDepth.of(still_m, camera),
+        )
+        self._last = self._movers(now, camera.unproject(depth_m), moving)
+        self._remember(now)
+        return self._paint(self._last, frame.depth_m.shape)
 
     def _with_last(self, prior: ProbabilityImage) -> ProbabilityImage:
         if self._last is None or not self._last.any():
             return prior
         return np.maximum(prior, self._paint(self._last, prior.shape))
 
-    def _movers(
-        self, stamp_ns: int, depth_m: DepthImage, T_odom_camera: Pose, camera: PinholeCamera
-    ) -> Mask:
+    def _movers(self, now: View, points: NDArray[np.float32], moving: NDArray[np.bool_]) -> Mask:
         """Seeds in former free space, without specks, grown to the objects they are part of."""
-        points = camera.unproject(depth_m)
-        seeds = np.zeros(depth_m.shape, np.uint8)
-        static = np.zeros(depth_m.shape, np.uint8)
-        for view in self._views_at(stamp_ns):
-            T_ref_camera = se3.inverse(view.T_odom_camera) @ T_odom_camera
-            gap = free_space_gap(points, T_ref_camera, view.free_m, camera)
+        depth_m = points[..., 2]
+        still = (depth_m > 0) & ~moving
+        sparse = points[2::4, 2::4][still[2::4, 2::4]]
+        seeds, static, oldest_static = (np.zeros(depth_m.shape, bool) for _ in range(3))
+        for view in self._views_for(now):
+            gap = self._gap_to(view, now, points, sparse)
             margin = self._margin(depth_m, gap)
-            agrees = (np.abs(gap) < margin).astype(np.uint8)
-            known = np.count_nonzero(np.isfinite(gap))
-            if np.count_nonzero(agrees) < self._config.min_inliers * known:
-                self._disbelieved += 1
+            agrees = np.abs(gap) < margin
+            known = np.isfinite(gap) & still
+            if np.count_nonzero(agrees & still) < self._config.min_inliers * np.count_nonzero(
+                known
+            ):
                 continue
-            np.maximum(seeds, (gap > margin).astype(np.uint8), out=seeds)
-            static = agrees  # the oldest frame comes last and has the last word
-        seeds = cv2.morphologyEx(seeds, cv2.MORPH_OPEN, _KERNEL)
-        seeds = drop_small(seeds, self._config.min_area * seeds.size)
+            # What was in its place longer ago did not move in since: that would be misalignment.
+            seeds |= (gap > margin) & ~static
+            if not static.any():
+                oldest_static = agrees
+            static |= agrees
+        seeds = without_specks(opened(seeds), self._config.min_area)
         if not seeds.any():
             return seeds
-        grown = grow(seeds, static, depth_m, self._config.share)
+        grown = grow(seeds, oldest_static, depth_m, self._config.share)
         if np.count_nonzero(grown) > self._config.max_area * grown.size:
             return np.zeros_like(grown)
         return grown
+
+    def _gap_to(
+        self, view: View, now: View, points: NDArray[np.float32], sparse: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        T_ref_camera = align_depth(
+            sparse,
+            view.inverse_depth,
+            se3.inverse(view.T_odom_camera) @ now.T_odom_camera,
+            self._config.depth_noise,
+        )
+        return free_space_gap(points, T_ref_camera, view.free_m, view.inverse_depth.camera)
 
     def _margin(self, depth_m: DepthImage, gap: NDArray[np.float32]) -> NDArray[np.float32]:
         """The gap that noise explains: both depths are noisy, the farther one more."""
@@ -183,14 +202,27 @@ class GeometricPrior:
         sigma = self._config.depth_noise * far**2
         return np.maximum(self._config.threshold_m, self._config.threshold_sigma * sigma)
 
-    def _views_at(self, stamp_ns: int) -> list[View]:
-        """Return the view nearest to each lag, without duplicates and without very recent ones."""
+    def _way_to(self, T_odom_camera: Pose) -> NDArray[np.float64]:
+        if not self._views:
+            return np.zeros(2)
+        last = self._views[-1]
+        step = se3.log(se3.inverse(last.T_odom_camera) @ T_odom_camera)
+        return last.way + (np.linalg.norm(step[:3]), np.linalg.norm(step[3:]))
+
+    def _views_for(self, now: View) -> list[View]:
+        """
+        Return the view nearest to each lag, oldest first.
+
+        Odometry drifts with the way and not with time, so what was seen before a long way is left
+        out; a camera that looks back and forth would else find its old surroundings displaced.
+        """
+        limit = (self._config.max_move, np.deg2rad(self._config.max_turn_deg))
+        near = [v for v in self._views if (now.way - v.way <= limit).all()]
         chosen: dict[int, View] = {}
-        for lag in self._lags_ns:
-            if not self._views or stamp_ns - self._views[0].stamp_ns < 0.7 * lag:
-                continue
-            view = min(self._views, key=lambda v: abs(stamp_ns - v.stamp_ns - lag))
-            chosen[view.stamp_ns] = view
+        for lag in reversed(self._lags_ns):
+            if near and now.stamp_ns - near[0].stamp_ns >= 0.7 * lag:
+                view = min(near, key=lambda v: abs(now.stamp_ns - v.stamp_ns - lag))
+                chosen[view.stamp_ns] = view
         return list(chosen.values())
 
     def _remember(self, view: View) -> None:
@@ -200,32 +232,28 @@ class GeometricPrior:
 
     def _paint(self, mask: Mask, shape: tuple[int, ...]) -> ProbabilityImage:
         value = np.uint8(round(255 * self._config.p_dynamic))
-        full = cv2.resize(mask * value, (shape[1], shape[0]), interpolation=cv2.INTER_NEAREST)
+        full = cv2.resize(
+            mask.astype(np.uint8) * value, (shape[1], shape[0]), interpolation=cv2.INTER_NEAREST
+        )
         return np.asarray(full, dtype=np.uint8)
 
 
-def drop_small(mask: Mask, min_pixels: float) -> Mask:
-    """Drop the connected regions of fewer pixels."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
-    if count <= 1:
-        return np.asarray(mask, dtype=np.uint8)
-    keep = stats[:, cv2.CC_STAT_AREA] >= min_pixels
-    keep[0] = False
-    return np.asarray(keep[labels], dtype=np.uint8)
+def _shrink(image: NDArray[Any], camera: PinholeCamera) -> NDArray[Any]:
+    """Pick pixels; averages would mix depths."""
+    size = (camera.width, camera.height)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST))
 
 
-def grow(
-    seeds: Mask, static: Mask, depth_m: DepthImage, share: float, step: float = 0.03
-) -> Mask:
+def grow(seeds: Mask, static: Mask, depth_m: DepthImage, share: float, step: float = 0.03) -> Mask:
     """
     Grow seeds to the smooth surfaces of which they are a good share.
 
     Parameters
     ----------
-    seeds : ndarray, shape (h, w), uint8
-        1 where something moved in.
-    static : ndarray, shape (h, w), uint8
-        1 where the surface has been in its place for long.
+    seeds : ndarray, shape (h, w), bool
+        True where something moved in.
+    static : ndarray, shape (h, w), bool
+        True where the surface has been in its place for long.
     depth_m : ndarray, shape (h, w), float32
         Metres; 0 where invalid.
     share : float
@@ -238,10 +266,10 @@ def grow(
     smooth = ((low > 0) & (high - low < 2 * step * depth_m)).astype(np.uint8)
     count, labels = cv2.connectedComponents(smooth, connectivity=4)
     area = np.bincount(labels.ravel(), minlength=count)
-    hit = np.bincount(labels[seeds > 0], minlength=count)
-    stays = np.bincount(labels[static > 0], minlength=count)
+    hit = np.bincount(labels[seeds], minlength=count)
+    stays = np.bincount(labels[static], minlength=count)
     moves = (hit >= share * area) & (hit > stays)
     moves[0] = False
     # Surfaces were cut one pixel inside their edges.
-    grown = np.asarray(moves[labels], dtype=np.uint8) | seeds
-    return np.asarray(cv2.dilate(grown, _KERNEL), dtype=np.uint8)
+    grown = (moves[labels] | seeds).astype(np.uint8)
+    return np.asarray(cv2.dilate(grown, _KERNEL) > 0)

@@ -108,9 +108,7 @@ class BoxHold:
 
     def _worth_holding(self, item: _Object, shape: tuple[int, int]) -> bool:
         certain = item.detection.score >= self._config.min_score and item.detection.p_dynamic > 0
-        return (
-            certain and item.missed < self._config.frames and _visible(item.box, shape) > 0.3
-        )
+        return certain and item.missed < self._config.frames and _visible(item.box, shape) > 0.3
 
     def _faded(self, item: _Object, shape: tuple[int, int]) -> Detection:
         score = item.detection.score * self._config.decay**item.missed

@@ -164,9 +164,7 @@ def _close(mask: Mask) -> Mask:
     return np.asarray(closed[size:-size, size:-size], dtype=np.uint8)
 
 
-def _coarse_box(
-    detection: Detection, shape: tuple[int, ...], step: int, margin: float
-) -> Box:
+def _coarse_box(detection: Detection, shape: tuple[int, ...], step: int, margin: float) -> Box:
     x0, y0, x1, y1 = detection.box_xyxy
     dx, dy = margin * (x1 - x0), margin * (y1 - y0)
     left = int(np.clip((x0 - dx) / step, 0, shape[1] - 2))

@@ -26,9 +26,7 @@ class Letterbox:
     offset_y: int
 
 
-def letterbox(
-    color: ColorImage, height: int, width: int
-) -> tuple[NDArray[np.float32], Letterbox]:
+def letterbox(color: ColorImage, height: int, width: int) -> tuple[NDArray[np.float32], Letterbox]:
     """
     Fit an image into the network's input, keeping its proportions.
 

@@ -48,6 +48,12 @@ class GeometricConfig:
     p_dynamic: float = param(0.75, 'prior of what was found', low=0.0, high=1.0)
     lag: float = param(0.25, 'age of the first frame compared with', unit='s', low=0.02, high=10.0)
     lags: int = param(4, 'frames compared with, each twice as old as the last', low=1, high=8)
+    max_turn_deg: float = param(
+        25.0, 'frames from before more turning than this are not compared', unit='deg', low=0.0
+    )
+    max_move: float = param(
+        0.8, 'frames from before a longer way than this are not compared', unit='m', low=0.0
+    )
     threshold_sigma: float = param(
         6.0, 'nearer than free space by this', unit='sigma_z', low=1.0, high=100.0
     )
