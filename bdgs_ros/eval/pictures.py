@@ -78,7 +78,8 @@ def write_animation(
     panels = [panel(view, width) for view in _evenly(views, len(views) or 1)]
     header = _header(panels[0].shape[1], width)
     images = [Image.fromarray(np.vstack([header, image])) for image in panels]
-    palette = images[len(images) // 2].quantize(256)
+    mosaic = Image.fromarray(np.vstack(panels[:: max(1, len(panels) // 4)]))
+    palette = mosaic.quantize(256, method=Image.Quantize.FASTOCTREE)  # keeps small bright things
     frames = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     write_aside(
         path,
