@@ -49,7 +49,7 @@ class ReplayNode(GraphNode):
         self._playback = Playback(self._reader, config)
         self._health = Health(self, 'replay')
         self._acks = Acknowledgements()
-        self._publishers = RawPublishers(
+        self._raw = RawPublishers(
             self, self._playback.topics, self._playback.layout, topics.image_qos(config.qos)
         )
         self._clock_publisher = self.create_publisher(Clock, topics.CLOCK, topics.RELIABLE)
@@ -87,7 +87,7 @@ class ReplayNode(GraphNode):
             self._check_stopping()
             if time.monotonic() >= deadline:
                 self.get_logger().warning(
-                    f'{self._publishers.subscribers()} of {wanted} subscribers of the camera '
+                    f'{self._raw.subscribers()} of {wanted} subscribers of the camera '
                     f'topics after {self._config.wait_timeout_s:g} s; starting anyway'
                 )
                 break
@@ -97,7 +97,7 @@ class ReplayNode(GraphNode):
 
     def _ready(self, wanted: int) -> bool:
         listening = not self._config.lockstep or self.count_publishers(topics.STATUS) > 0
-        return self._publishers.subscribers() >= wanted and (listening or not wanted)
+        return self._raw.subscribers() >= wanted and (listening or not wanted)
 
     def _play_realtime(self) -> None:
         """Send every message at its time; who cannot keep up misses it."""
@@ -157,7 +157,7 @@ class ReplayNode(GraphNode):
     def _send(self, message: RawMessage) -> None:
         self._check_stopping()
         self._clock_publisher.publish(Clock(clock=conversions.time_message(message.stamp_ns)))
-        self._publishers.publish(message)
+        self._raw.publish(message)
         self._sent_s[message.topic, message.stamp_ns] = time.perf_counter()
         while len(self._sent_s) > _SENT_KEPT:
             self._sent_s.popitem(last=False)
@@ -199,7 +199,7 @@ class ReplayNode(GraphNode):
             self._health.add_timing('image_to_status', milliseconds)
         self._health.counts['frames_sent'] = acks.sent
         self._health.counts['frames_missed_by_tracking'] = acks.missed
-        self._publishers.wait_delivered(_QUIET_S)
+        self._raw.wait_delivered(_QUIET_S)
         self._health.publish()
         time.sleep(_POLL_S)
 
