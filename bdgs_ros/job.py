@@ -25,6 +25,7 @@ class Job:
     output: Path
     config: BdgsConfig = field(default_factory=BdgsConfig)
     camera_file: Path | None = None
+    allow_truncated: bool = False
     start: int = 0
     frames: int | None = None
     pictures: bool = True
@@ -75,7 +76,7 @@ def run_job(job: Job) -> dict[str, Any]:
 def _open(job: Job) -> Sequence:
     from bdgs_ros.data.layouts import open_sequence
 
-    return open_sequence(job.recording, job.camera_file)
+    return open_sequence(job.recording, job.camera_file, allow_truncated=job.allow_truncated)
 
 
 def choose_frames(available: int, start: int, count: int | None) -> range:

@@ -30,6 +30,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--camera', type=Path, metavar='FILE', help='camera.yaml of the recording')
     parser.add_argument('--start', type=int, default=0, metavar='N', help='first frame')
     parser.add_argument('--frames', type=int, metavar='N', help='number of frames')
+    parser.add_argument(
+        '--allow-truncated', action='store_true', help='use what is readable of a cut-off bag'
+    )
     parser.add_argument('--no-pictures', action='store_true', help='leave the pictures out')
     parser.add_argument('--json', action='store_true', help='print the metrics for machines')
     add_config_arguments(parser)
@@ -44,6 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
         output=arguments.output,
         config=with_weights(load_config(arguments), arguments.weights),
         camera_file=arguments.camera,
+        allow_truncated=arguments.allow_truncated,
         start=arguments.start,
         frames=arguments.frames,
         pictures=not arguments.no_pictures,

@@ -151,7 +151,7 @@ def test_run_writes_results_and_prints_them(monkeypatch, tmp_path, capsys):
     import bdgs_ros.pipeline
     from bdgs_ros.data import layouts
 
-    monkeypatch.setattr(layouts, 'open_sequence', lambda path, camera: FakeSequence(20))
+    monkeypatch.setattr(layouts, 'open_sequence', lambda *_, **__: FakeSequence(20))
     monkeypatch.setattr(bdgs_ros.pipeline, 'BdgsSlam', lambda config: FakeSlam())
     words = ['run', str(tmp_path / 'seq'), '--output', str(tmp_path / 'out')]
     assert main.main([*words, '--start', '4', '--frames', '10', '--no-pictures', '--json']) == 0
