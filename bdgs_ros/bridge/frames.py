@@ -155,8 +155,9 @@ class FrameSource:
         self._health.counts['jumps_back'] = counts.jumps
 
     def _watch(self) -> None:
-        for text in self._watchdog.check(time.monotonic()):
-            self._node.get_logger().warning(text)
+        logger = self._node.get_logger()
+        for change in self._watchdog.check(time.monotonic()):
+            (logger.warning if change.is_bad else logger.info)(change.text)
         silent = self._watchdog.silent()
         self._health.mark('silent', f'silent: {", ".join(silent)}' if silent else '')
         apart = (

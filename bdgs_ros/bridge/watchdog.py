@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 
 @dataclass
@@ -15,6 +16,13 @@ class _Topic:
     """Whether one message is enough (camera_info)."""
     last_s: float | None = None
     warned: bool = False
+
+
+class Change(NamedTuple):
+    """Something the user should know."""
+
+    is_bad: bool
+    text: str
 
 
 class Watchdog:
@@ -48,44 +56,56 @@ class Watchdog:
         """Say that a message has arrived."""
         self._topics[name].last_s = now_s
 
-    def check(self, now_s: float) -> list[str]:
+    def check(self, now_s: float) -> list[Change]:
         """Return what has changed for the worse or the better since the last check."""
-        return [text for topic in self._topics.values() if (text := self._check(topic, now_s))]
+        changed = [topic for topic in self._topics.values() if self._update(topic, now_s)]
+        back = [topic.name for topic in changed if not topic.warned]
+        changes = [Change(False, f'{_quoted(back)}: back')] if back else []
+        groups: dict[str, list[_Topic]] = {}
+        for topic in changed:
+            if topic.warned:
+                groups.setdefault(self._reason(topic), []).append(topic)
+        for reason, group in groups.items():
+            changes.append(Change(True, self._describe(group, reason, now_s)))
+        return changes
 
     def silent(self) -> list[str]:
         """Return the topics that were silent at the last check."""
         return [topic.name for topic in self._topics.values() if topic.warned]
 
-    def _check(self, topic: _Topic, now_s: float) -> str:
-        since = self._started_s if topic.last_s is None else topic.last_s
+    def _update(self, topic: _Topic, now_s: float) -> bool:
+        """Return whether a topic has fallen silent or come back."""
         done = topic.once and topic.last_s is not None
-        is_silent = not done and now_s - since > self._silence_s
-        if is_silent == topic.warned:
-            return ''
+        is_silent = not done and now_s - self._since_s(topic) > self._silence_s
+        changed = is_silent != topic.warned
         topic.warned = is_silent
-        if not is_silent:
-            return f"'{topic.name}' is back"
-        return self._describe(topic, now_s - since, now_s)
+        return changed
 
-    def _describe(self, topic: _Topic, silent_s: float, now_s: float) -> str:
-        never = 'nothing was ever received' if topic.last_s is None else 'nothing received'
-        count = self._publishers(topic.name)
-        if count == 0:
-            reason = 'it has no publisher: start the camera or replay, or remap the topic'
-        elif topic.last_s is None:
-            reason = (
-                f'it has {count} publisher(s): they are silent, or their quality of service does '
-                'not match (try qos.reliability:=best_effort)'
+    def _since_s(self, topic: _Topic) -> float:
+        return self._started_s if topic.last_s is None else topic.last_s
+
+    def _reason(self, topic: _Topic) -> str:
+        if self._publishers(topic.name) == 0:
+            return 'no publisher: start the camera or the replay, or remap the topic'
+        if topic.last_s is None:
+            return (
+                'its publisher is silent, or its quality of service does not match (try '
+                'qos.reliability:=best_effort)'
             )
-        else:
-            reason = f'its {count} publisher(s) went silent'
-        others = [
-            other.name
-            for other in self._topics.values()
-            if other is not topic
-            and other.last_s is not None
-            and (other.once or now_s - other.last_s <= self._silence_s)
+        return 'its publisher went silent'
+
+    def _describe(self, group: list[_Topic], reason: str, now_s: float) -> str:
+        silent_s = now_s - max(self._since_s(topic) for topic in group)
+        never = 'never received anything' if group[0].last_s is None else 'nothing received'
+        arriving = [
+            topic.name
+            for topic in self._topics.values()
+            if not topic.warned and topic.last_s is not None
         ]
-        names = ', '.join(f"'{name}'" for name in others)
-        beside = f'; {names} did arrive' if others else ''
-        return f"'{topic.name}': {never} for {silent_s:.1f} s; {reason}{beside}"
+        beside = f'; {_quoted(arriving)} did arrive' if arriving else ''
+        names = _quoted([topic.name for topic in group])
+        return f'{names}: {never} for {silent_s:.1f} s; {reason}{beside}'
+
+
+def _quoted(names: list[str]) -> str:
+    return ', '.join(f"'{name}'" for name in names)

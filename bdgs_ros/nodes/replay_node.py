@@ -199,7 +199,8 @@ class ReplayNode(GraphNode):
             self._health.add_timing('image_to_status', milliseconds)
         self._health.counts['frames_sent'] = acks.sent
         self._health.counts['frames_missed_by_tracking'] = acks.missed
-        self._raw.wait_delivered(_QUIET_S)
+        if acks.missed:
+            self._raw.wait_delivered(_QUIET_S)
         self._health.publish()
         time.sleep(_POLL_S)
 
