@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from bdgs_ros.data.synth.shapes import Quad, QuadSet
 
 LEVELS = 5
-_GUTTER = 2 ** (LEVELS - 1)  # one texel of margin is left at the coarsest level
+_GUTTER = 1 << (LEVELS - 1)  # one texel of margin is left at the coarsest level
 _WIDTH = 4096
 
 

@@ -52,7 +52,7 @@ def _handheld(t: float, phase: Array) -> tuple[Array, Array]:
 
 def _xyz(t: float, phase: Array) -> tuple[Array, Array]:
     lead = _in_turn(t, 9.0, 3)
-    waves = [_wave(t, p, f) for p, f in zip((5.0, 4.7, 5.3), phase, strict=False)]
+    waves = [_wave(t, p, f) for p, f in zip((5.8, 5.4, 6.1), phase, strict=False)]
     offset = np.array([0.30, 0.22, 0.30]) * lead * waves
     jitter_m, jitter_rad = _handheld(t, phase)
     return offset + jitter_m, 4 * jitter_rad
@@ -60,10 +60,10 @@ def _xyz(t: float, phase: Array) -> tuple[Array, Array]:
 
 def _rpy(t: float, phase: Array) -> tuple[Array, Array]:
     lead = _in_turn(t, 9.0, 3)
-    waves = [_wave(t, p, f) for p, f in zip((4.4, 4.8, 4.6), phase, strict=False)]
+    waves = [_wave(t, p, f) for p, f in zip((5.2, 5.6, 5.4), phase, strict=False)]
     angles = np.radians(20) * lead * waves
     jitter_m, jitter_rad = _handheld(t, phase)
-    return 5 * jitter_m, angles + jitter_rad
+    return 3 * jitter_m, angles + jitter_rad
 
 
 def _gentle(t: float, phase: Array) -> tuple[Array, Array]:
@@ -79,7 +79,7 @@ def _gentle(t: float, phase: Array) -> tuple[Array, Array]:
 
 def _survey(t: float, phase: Array) -> tuple[Array, Array]:
     offset, angles = _gentle(t, phase)
-    return 1.3 * offset, 1.6 * angles
+    return 1.15 * offset, 1.6 * angles
 
 
 _MOTIONS: dict[str, Motion] = {
@@ -129,7 +129,7 @@ def camera_path(kind: str, rng: np.random.Generator, position: Array, target: Ar
     """Return a camera path of a kind, its place and phases varied a little by the seed."""
     return CameraPath(
         kind,
-        position + rng.uniform(-0.12, 0.12, 3) * (1, 1, 0.5),
+        position + rng.uniform(-0.12, 0.12, 3) * (0.5, 1, 0.5),
         target + rng.uniform(-0.15, 0.15, 3) * (1, 1, 0.5),
         rng.uniform(0, 2 * np.pi, 6),
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from bdgs_ros.data.synth.shapes import Quad
 
 Array = NDArray[np.float64]
+Image = NDArray[np.float32]
 AMBIENT = 0.42
 _LUXEL_M = 0.12
 _FALLOFF_M = 3.0
@@ -64,17 +66,23 @@ class Lighting:
             total += cosine * reach * self._visible(points, ray)
         return AMBIENT + (total / len(self.lamps)).reshape(rows, columns)
 
+    @cached_property
+    def _T_box_world(self) -> Image:
+        """All occluders, float32 [O, 4, 4]."""
+        return np.array([o.T_box_world for o in self.occluders], np.float32).reshape(-1, 4, 4)
+
     def _visible(self, points: Array, rays: Array) -> Array:
         """Tell which segments points + t rays, t in [0, 1], miss every box (slab method)."""
-        clear = np.ones(len(points), bool)
-        for occluder in self.occluders:
-            T = occluder.T_box_world
-            start, step = points @ T[:3, :3].T + T[:3, 3], rays @ T[:3, :3].T
-            step = np.where(np.abs(step) < 1e-9, 1e-9, step)
-            a, b = (-1 - start) / step, (1 - start) / step
-            enter, leave = np.minimum(a, b).max(1), np.maximum(a, b).min(1)
-            clear &= ~((enter < np.minimum(leave, 1)) & (leave > 0.0))
-        return clear.astype(np.float64)
+        T = self._T_box_world
+        rotation = T[:, :3, :3]
+        start = rotation @ points.T.astype(np.float32) + T[:, :3, 3:]  # [O, 3, n]
+        step = rotation @ rays.T.astype(np.float32)
+        step[np.abs(step) < 1e-9] = 1e-9
+        inverse = 1 / step
+        middle, half = -start * inverse, np.abs(inverse)
+        enter, leave = (middle - half).max(axis=1), (middle + half).min(axis=1)
+        hit = (enter < np.minimum(leave, 1)) & (leave > 0)
+        return np.asarray(~hit.any(axis=0), np.float64)
 
 
 def occluder_of_box(centre: Array, size: Array, T_world_object: Array) -> Occluder:
@@ -82,4 +90,4 @@ def occluder_of_box(centre: Array, size: Array, T_world_object: Array) -> Occlud
     T_object_box = np.eye(4)
     T_object_box[:3, :3] = np.diag(np.asarray(size) / 2 * 0.98)
     T_object_box[:3, 3] = centre
-    return Occluder(np.linalg.inv(T_world_object @ T_object_box))
+    return Occluder(np.asarray(np.linalg.inv(T_world_object @ T_object_box), np.float64))

@@ -2,10 +2,10 @@
 Which surface each pixel sees, and how far it is: exact, one sample per pixel.
 
 A pixel's ray is d = (x, y, 1), so a point at depth z is `z d` and `w = 1 / z` is the quantity
-that is linear on planes: for a plane n . p = c it is `w = n . d / c`. Rectangles are filled row by
-row between the columns where their edges (linear in x and y too) change sign. Quadrics are
-solved per pixel in their bounding box: p' A p + 2 b' p + g = 0 gives g w^2 + 2 (b.d) w + d'A d = 0,
-whose larger root is the near side.
+that is linear on planes: for a plane n . p = c it is `w = n . d / c`. Rectangles are filled row
+by row between the columns where their edges (linear in x and y too) change sign. Quadrics are
+solved per pixel in their bounding box: p' A p + 2 b' p + g = 0 gives
+g w^2 + 2 (b.d) w + d'A d = 0, whose larger root is the near side.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ class SampleGrid:
     @staticmethod
     def of(camera: PinholeCamera, shift: tuple[float, float] = (0.0, 0.0)) -> SampleGrid:
         """Return the grid through pixel centres, or `shift` (right, down) pixels beside them."""
-        x = (np.arange(camera.width) + shift[0] - camera.cx) / camera.fx
-        y = (np.arange(camera.height) + shift[1] - camera.cy) / camera.fy
+        x: Array = (np.arange(camera.width) + shift[0] - camera.cx) / camera.fx
+        y: Array = (np.arange(camera.height) + shift[1] - camera.cy) / camera.fy
         return SampleGrid(x, y, 1 / camera.fx)
 
 
@@ -140,7 +140,7 @@ class QuadricForms:
     @staticmethod
     def of(quadrics: QuadricSet) -> QuadricForms:
         """Return the forms of quadrics given in the camera frame."""
-        inverse = np.linalg.inv(quadrics.T)
+        inverse: Array = np.asarray(np.linalg.inv(quadrics.T), np.float64)
         shape = np.zeros((len(quadrics), 4, 4))
         shape[:, [0, 1], [0, 1]] = 1.0
         k, is_limb = quadrics.taper, quadrics.is_limb
@@ -180,9 +180,7 @@ def _linear(coefficients: Array, x: Array, y: Array) -> Image:
     return np.asarray(row[:, None] + column)
 
 
-def _near_root(
-    forms: QuadricForms, k: int, x: Array, y: Array
-) -> tuple[Image, NDArray[np.bool_]]:
+def _near_root(forms: QuadricForms, k: int, x: Array, y: Array) -> tuple[Image, NDArray[np.bool_]]:
     """Return inverse depth of the near side and where the ray meets the quadric."""
     m = forms.discriminant[k]
     x0, y0 = x[len(x) // 2], y[len(y) // 2]  # about the middle float32 loses nothing

@@ -68,10 +68,10 @@ class FrameRenderer:
         bare = seen if everything is static else draw(self._view(static, time_s), grid)
         return FrameImages(
             color=self._color(time_s, None, self._exposure_s),
-            depth_m=1 / seen.inv_depth,
+            depth_m=np.float32(1) / seen.inv_depth,
             object_id=_object_ids(everything, seen),
             static_color=self._color(time_s, static, 0.0),
-            static_depth_m=1 / bare.inv_depth,
+            static_depth_m=np.float32(1) / bare.inv_depth,
         )
 
     def brightness(self, time_s: float) -> float:

@@ -60,9 +60,7 @@ class Furniture:
         for name, origin, u, v in box_faces(np.array(centre), np.array(size), skip):
             chosen = (faces or {}).get(name, paint)
             corner = T[:3, :3] @ origin + T[:3, 3]
-            self.quads.append(
-                rectangle(corner, T[:3, :3] @ u, T[:3, :3] @ v, density, chosen)
-            )
+            self.quads.append(rectangle(corner, T[:3, :3] @ u, T[:3, :3] @ v, density, chosen))
         self.occluders.append(occluder_of_box(np.array(centre), np.array(size), T))
 
 
@@ -126,9 +124,7 @@ def _fill_board(
         y += w + float(rng.uniform(0.02, 0.15))
 
 
-def crate(
-    rng: np.random.Generator, T: Array, size: tuple[float, float, float]
-) -> Furniture:
+def crate(rng: np.random.Generator, T: Array, size: tuple[float, float, float]) -> Furniture:
     """Return a cardboard box that stands on the origin of its frame."""
     item = Furniture(T)
     item.box((0, 0, size[2] / 2), size, lambda h, w: textures.carton(rng, h, w), skip='z-')
@@ -172,9 +168,7 @@ def clutter(
     for x, spot in spots:
         height = float(rng.uniform(0.05, 0.2))
         box = (float(rng.uniform(0.12, 0.22)), float(rng.uniform(0.1, 0.22)), height)
-        item.box(
-            (x, spot, z + height / 2), box, lambda h, w: textures.books(rng, h, w), skip='z-'
-        )
+        item.box((x, spot, z + height / 2), box, lambda h, w: textures.books(rng, h, w), skip='z-')
     return item
 
 

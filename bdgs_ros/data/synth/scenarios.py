@@ -77,18 +77,16 @@ def _crowd(layout: Layout, rng: np.random.Generator, duration_s: float) -> list[
     first, start = layout.next_id, 0.3 * duration_s
     turn = float(rng.choice([-1.0, 1.0]))
     paths = [_table_loop(layout, rng, phase) for phase in rng.uniform(0, 1, 2)]
-    for phase in (-0.055, 0.0, 0.055):  # waits beside the near lane
-        shift = float(rng.uniform(-0.008, 0.008))
-        paths.append(_near_loop(layout, 1.62, 1.1, phase + shift, start, turn))
-    for phase in (0.44, 0.5, 0.56):  # waits at the other side, comes along the lane behind
-        shift = float(rng.uniform(-0.008, 0.008))
-        paths.append(_near_loop(layout, 1.68, 1.1, phase + shift, start, turn))
+    for phase in (-0.05, 0.0, 0.05, 0.1):  # waits beside the near lane
+        shift = float(rng.uniform(-0.006, 0.006))
+        paths.append(_near_loop(layout, 1.64, 1.1, phase + shift, start, turn))
+    for phase in (0.46, 0.52, 0.58):  # waits at the other side, comes along the lane behind
+        shift = float(rng.uniform(-0.006, 0.006))
+        paths.append(_near_loop(layout, 1.70, 1.1, phase + shift, start, turn))
     return [person(first + k, rng, path) for k, path in enumerate(paths)]
 
 
-def _unknown_box(
-    layout: Layout, rng: np.random.Generator, duration_s: float
-) -> list[SceneObject]:
+def _unknown_box(layout: Layout, rng: np.random.Generator, duration_s: float) -> list[SceneObject]:
     """A walker brings a box, puts it on the table, goes, comes back and takes it away."""
     first, m = layout.next_id, layout.free_end
     x, y = layout.table_centre
@@ -122,14 +120,12 @@ def _unknown_box(
     ]
 
 
-def _chair_moved(
-    layout: Layout, rng: np.random.Generator, duration_s: float
-) -> list[SceneObject]:
+def _chair_moved(layout: Layout, rng: np.random.Generator, duration_s: float) -> list[SceneObject]:
     """A walker comes, pushes a chair across the view, and goes."""
     first, m = layout.next_id, float(rng.choice([-1.0, 1.0]))
-    middle, x = layout.size[1] / 2, float(rng.uniform(2.65, 2.8))
-    way = float(rng.uniform(0.85, 1.05))
-    chair_y = middle + m * float(rng.uniform(0.5, 0.6))
+    middle, x = layout.size[1] / 2, float(rng.uniform(2.8, 2.92))
+    way = float(rng.uniform(0.85, 1.0))
+    chair_y = middle + m * float(rng.uniform(0.42, 0.52))
     ahead = -m * np.pi / 2
     start, end = chair_y + m * CHAIR_REACH_M, chair_y + m * (CHAIR_REACH_M - way)
     enter, leave = (1.25, middle + m * 2.15), (1.25, middle - m * 2.15)

@@ -99,18 +99,16 @@ def sense_depth(
     valid &= (z > sensor.near_m) & (z < sensor.far_m)
     sigma = np.float32(0.0012) + np.float32(0.0019) * (z - np.float32(0.4)) ** 2
     noisy = np.maximum(z + sigma * _patchy_noise(z.shape, rng), np.float32(0.1))
-    steps = np.float32(
-        sensor.baseline_m * sensor.disparity_focal_px * sensor.disparity_steps
-    )
+    steps = np.float32(sensor.baseline_m * sensor.disparity_focal_px * sensor.disparity_steps)
     measured = steps / np.maximum(np.rint(steps / noisy), 1)
     units = np.where(valid, measured * DEPTH_SCALE + np.float32(0.5), 0)
     return np.asarray(np.minimum(units, 65535).astype(np.uint16))
 
 
 def _shadow(depth_m: Image, camera: PinholeCamera, sensor: DepthSensor) -> NDArray[np.bool_]:
-    """Tell which points the projector, `baseline` to the left, cannot see for a nearer one."""
-    # the projector sees column u at u + f b / z; what lies behind something to the right of it
-    # in the camera's image but left of it in the projector's is hidden
+    """Tell which points the projector, `baseline` to the right, cannot see for a nearer one."""
+    # The projector has column u of the camera at u - f b / z. A point is hidden where something
+    # to its right in the camera's image is to its left in the projector's.
     reach = np.float32(camera.fx * sensor.baseline_m)
     column = np.arange(camera.width, dtype=np.float32) - reach / depth_m
     nearest = np.minimum.accumulate(column[:, ::-1], axis=1)[:, ::-1]
@@ -124,9 +122,7 @@ def _too_steep(depth_m: Image, camera: PinholeCamera, sensor: DepthSensor) -> ND
     return np.asarray(slope * np.float32(camera.fx / 2) > np.float32(sensor.steepest) * depth_m)
 
 
-def _coarse(
-    shape: tuple[int, ...], cell: int, rng: np.random.Generator
-) -> Image:
+def _coarse(shape: tuple[int, ...], cell: int, rng: np.random.Generator) -> Image:
     small = rng.standard_normal((shape[0] // cell + 2, shape[1] // cell + 2), dtype=np.float32)
     return np.asarray(
         cv2.resize(small, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR), np.float32
@@ -156,7 +152,7 @@ def _jitter(
 
 
 def _patchy_noise(shape: tuple[int, ...], rng: np.random.Generator) -> Image:
-    """Return unit noise whose neighbours are alike, as the matching window of the sensor has it."""
+    """Return unit noise whose neighbours are alike, as the sensor's matching window makes it."""
     white = rng.standard_normal(shape, dtype=np.float32)
     smooth = cv2.GaussianBlur(white, (5, 5), 0.8)
     return np.asarray(smooth * np.float32(2 * np.sqrt(np.pi) * 0.8 * 0.97), np.float32)

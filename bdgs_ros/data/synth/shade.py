@@ -65,9 +65,7 @@ def shade(
     return np.asarray(colors, np.uint8)
 
 
-def _quad_texels(
-    quads: QuadSet, seen: Visibility, grid: SampleGrid
-) -> tuple[Image, Image, Image]:
+def _quad_texels(quads: QuadSet, seen: Visibility, grid: SampleGrid) -> tuple[Image, Image, Image]:
     """Return atlas position (x, y) and mip level of every pixel as if all saw rectangles."""
     index = np.clip(seen.surface, 0, len(quads) - 1)
     x, y = grid.x.astype(np.float32), grid.y.astype(np.float32)[:, None]
@@ -115,7 +113,10 @@ class _Bodies:
         m = scene.forms.canonical.astype(np.float32)
         local = np.stack(
             [
-                m[:, i, 0][part] * x + m[:, i, 1][part] * y + m[:, i, 2][part] / w + m[:, i, 3][part]
+                m[:, i, 0][part] * x
+                + m[:, i, 1][part] * y
+                + m[:, i, 2][part] / w
+                + m[:, i, 3][part]
                 for i in range(3)
             ]
         )

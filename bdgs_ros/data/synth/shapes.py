@@ -132,9 +132,7 @@ def ellipsoid(centre: Array, radii: Array, axes: Matrix | None = None) -> Matrix
     return T
 
 
-def limb(
-    start: Array, end: Array, radius: float, front: Array, flatness: float = 1.0
-) -> Matrix:
+def limb(start: Array, end: Array, radius: float, front: Array, flatness: float = 1.0) -> Matrix:
     """
     Return the canonical-to-frame map of a limb from `start`, where its radius is `radius`.
 

@@ -71,7 +71,7 @@ def wood(rng: np.random.Generator, height: int, width: int, rgb: Rgb | None = No
     rows = np.arange(height, dtype=np.float32)[:, None]
     grain = 0.16 * np.sin(rows * 0.22 + 7 * warp) + 0.10 * warp
     fine = noise(rng, height, width, 4, 1) * 0.06
-    return plain(height, width, base) * (1 + grain + fine)[..., None]
+    return np.asarray(plain(height, width, base) * (1 + grain + fine)[..., None], np.float32)
 
 
 def planks(rng: np.random.Generator, height: int, width: int, density: float) -> Texture:
@@ -132,7 +132,9 @@ def rug(rng: np.random.Generator, height: int, width: int) -> Texture:
     diamonds = (np.abs((xx % (2 * cell)) - cell) + np.abs((yy % (2 * cell)) - cell)) / cell
     index = np.where(border < 3 * cell, border // (0.75 * cell), 4 + (diamonds > 0.9))
     index = np.where(diamonds > 1.5, 6, index).astype(int) % 7
-    return palette[index] * (1 + 0.22 * noise(rng, height, width, 8, 3))[..., None]
+    return np.asarray(
+        palette[index] * (1 + 0.22 * noise(rng, height, width, 8, 3))[..., None], np.float32
+    )
 
 
 def books(rng: np.random.Generator, height: int, width: int) -> Texture:
@@ -179,7 +181,7 @@ def cloth(rng: np.random.Generator, height: int, width: int, rgb: Rgb) -> Textur
         x = (width - w) // 2
         texture[h : 2 * h, x : x + w] = poster(rng, h, w)
     folds = noise(rng, height, width, 40, 3) * 0.12 + noise(rng, height, width, 3, 1) * 0.05
-    return texture * (1 + folds)[..., None]
+    return np.asarray(texture * (1 + folds)[..., None], np.float32)
 
 
 def head(rng: np.random.Generator, height: int, width: int) -> Texture:
@@ -217,7 +219,7 @@ def _draw_face(texture: Texture, skin: Rgb) -> None:
 
 def skin_color(rng: np.random.Generator) -> Rgb:
     """Draw a colour of skin."""
-    tone = float(rng.uniform(0.45, 1.0))
+    tone = float(rng.uniform(0.6, 1.1))
     return 0.82 * tone, 0.6 * tone, 0.48 * tone
 
 

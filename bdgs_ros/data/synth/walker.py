@@ -111,8 +111,8 @@ def _trunk(pelvis: Array) -> list[Part]:
         _limb(neck - 0.03 * up, neck + 0.1 * up, 0.058, 0.052, _SKIN),
         _ball(neck + np.array([0.02, 0, 0.18]), (0.098, 0.078, 0.125), _HEAD),
         _ball(neck + np.array([0.115, 0, 0.165]), (0.02, 0.013, 0.022), _SKIN),
-        _ball(neck + np.array([0.01, 0.078, 0.17]), (0.02, 0.012, 0.03), _SKIN),
-        _ball(neck + np.array([0.01, -0.078, 0.17]), (0.02, 0.012, 0.03), _SKIN),
+        _ball(neck + np.array([0.01, 0.076, 0.17]), (0.014, 0.008, 0.024), _SKIN),
+        _ball(neck + np.array([0.01, -0.076, 0.17]), (0.014, 0.008, 0.024), _SKIN),
     ]
 
 
@@ -142,9 +142,7 @@ def _leg(pelvis: Array, side: float, phase: float, swing: float) -> list[Part]:
     ]
 
 
-def _arm(
-    pelvis: Array, side: float, phase: float, swing: float, held: Array | None
-) -> list[Part]:
+def _arm(pelvis: Array, side: float, phase: float, swing: float, held: Array | None) -> list[Part]:
     shoulder = pelvis + np.array([0, 0.205 * side, 0.465])
     if held is None:
         angle = -0.45 * swing * np.sin(phase)

@@ -1,4 +1,4 @@
-"""Write a synthetic recording: every frame on its own, so that any number of processes may help."""
+"""Write a synthetic recording, each frame on its own so that several processes may share them."""
 
 from __future__ import annotations
 
@@ -149,6 +149,11 @@ class FrameWorker:
             _write_png(self._folder / kind / name, image)
         return float(dynamic.mean())
 
+    def write_lists(self, gains: Sequence[float]) -> None:
+        """Write everything that is not an image."""
+        _write_lists(self._plan, self.world, self._folder, gains)
+        _write_objects(self._plan, self.world, self._folder)
+
     def _files(
         self,
         images: FrameImages,
@@ -194,6 +199,11 @@ def _brightness(frame: int) -> float:
 def _write(frame: int, gain: float) -> float:
     assert _worker is not None
     return _worker.write(frame, gain)
+
+
+def _write_lists_there(gains: Sequence[float]) -> None:
+    assert _worker is not None
+    _worker.write_lists(gains)
 
 
 def write_recording(
@@ -245,9 +255,7 @@ def write_recording(
             (partial / name).mkdir(parents=True)
         workers = min(jobs or os.cpu_count() or 1, frames)
         run = _run_here if workers == 1 else _run_in_processes
-        gains, coverage = run(plan, partial, workers, progress or (lambda done, total: None))
-        _write_lists(plan, partial, gains)
-        _write_objects(plan, partial)
+        coverage = run(plan, partial, workers, progress or (lambda done, total: None))
     return RecordingSummary(
         folder=str(folder),
         scenario=scenario,
@@ -268,21 +276,20 @@ def _gains(plan: RecordingPlan, brightness: Sequence[float]) -> list[float]:
     return [float(g) for g in auto_exposure(every, 1 / plan.rate_hz, ColorSensor())]
 
 
-def _run_here(
-    plan: RecordingPlan, folder: Path, workers: int, progress: Progress
-) -> tuple[list[float], list[float]]:
+def _run_here(plan: RecordingPlan, folder: Path, workers: int, progress: Progress) -> list[float]:
     worker = FrameWorker(plan, folder)
     gains = _gains(plan, [worker.brightness(frame) for frame in _metered(plan)])
     coverage = []
     for frame, gain in enumerate(gains):
         coverage.append(worker.write(frame, gain))
         progress(frame + 1, plan.frames)
-    return gains, coverage
+    worker.write_lists(gains)
+    return coverage
 
 
 def _run_in_processes(
     plan: RecordingPlan, folder: Path, workers: int, progress: Progress
-) -> tuple[list[float], list[float]]:
+) -> list[float]:
     context = multiprocessing.get_context('spawn')
     pool = ProcessPoolExecutor(workers, context, initializer=_start, initargs=(plan, folder))
     try:
@@ -291,9 +298,10 @@ def _run_in_processes(
         for done in pool.map(_write, range(plan.frames), gains):
             coverage.append(done)
             progress(len(coverage), plan.frames)
+        pool.submit(_write_lists_there, gains).result()
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
-    return gains, coverage
+    return coverage
 
 
 def _check_target(folder: Path, force: bool) -> None:
@@ -339,12 +347,12 @@ def _pose_row(stamp_ns: int, T: NDArray[np.float64]) -> str:
     return ' '.join([stamp_text(stamp_ns), *(f'{v:.9f}' for v in (*position, *quat))])
 
 
-def _write_lists(plan: RecordingPlan, folder: Path, gains: Sequence[float]) -> None:
+def _write_lists(plan: RecordingPlan, world: World, folder: Path, gains: Sequence[float]) -> None:
     stamps = [plan.stamp_ns(k) for k in range(plan.frames)]
     for kind, title in (('rgb', 'color images'), ('depth', 'depth maps')):
         rows = [f'{stamp_text(s)} {kind}/{stamp_text(s)}.png' for s in stamps]
         _write_text(folder / f'{kind}.txt', [f'# {title}', '# timestamp filename', *rows])
-    path = plan.world().camera_path
+    path = world.camera_path
     poses = [_pose_row(s, path.pose(plan.time_s(k))) for k, s in enumerate(stamps)]
     header = ['# ground truth trajectory', '# timestamp tx ty tz qx qy qz qw']
     for name in ('groundtruth.txt', 'truth/groundtruth.txt'):
@@ -369,15 +377,14 @@ def _write_text(path: Path, lines: Sequence[str]) -> None:
     path.write_text('\n'.join(lines) + '\n')
 
 
-def _write_objects(plan: RecordingPlan, folder: Path) -> None:
-    objects = plan.world().scene.objects
+def _write_objects(plan: RecordingPlan, world: World, folder: Path) -> None:
     content = {
         'scenario': plan.scenario,
         'seed': plan.seed,
         'frames': plan.frames,
         'size': [plan.width, plan.height],
         'rate_hz': plan.rate_hz,
-        'objects': [_describe(item, plan) for item in objects],
+        'objects': [_describe(item, plan) for item in world.scene.objects],
     }
     (folder / 'truth/objects.json').write_text(json.dumps(content, indent=1) + '\n')
 
