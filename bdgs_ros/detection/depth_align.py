@@ -77,7 +77,7 @@ def align_depth(
         Gauss-Newton with Geman-McClure weights, held to the start by the odometry's uncertainty.
 
     """
-    start, pose = T_ref_camera, T_ref_camera
+    pose, way = T_ref_camera, np.zeros(6)
     information = np.diag(_PRIOR_SIGMA**-2.0)
     for scale in _SCALES:
         residual, jacobian = _linearise(points_camera, reference, pose)
@@ -86,8 +86,8 @@ def align_depth(
         weighted = jacobian * weight[:, None]
         hessian = (weighted.T @ jacobian).astype(np.float64) + information
         slope = (weighted.T @ residual).astype(np.float64)
-        slope += information @ se3.log(pose @ se3.inverse(start))
-        pose = se3.exp(-np.linalg.solve(hessian, slope)) @ pose
+        step = np.asarray(-np.linalg.solve(hessian, slope + information @ way), np.float64)
+        pose, way = se3.exp(step) @ pose, way + step  # small motions add up
     return pose
 
 

@@ -1,11 +1,9 @@
-"""Where the camera went over the last seconds: what the geometric prior needs to compare frames."""
+"""Where the camera went over the last seconds, so that the geometric prior can compare frames."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Protocol
-
-import numpy as np
 
 from bdgs_ros.core import se3
 from bdgs_ros.core.config.detection import GeometricConfig
@@ -35,6 +33,7 @@ class _Anchor:
     pyramid: ImagePyramid
 
 
+_MIN_INLIERS = 0.25  # fewer: the pose follows something that moves
 _MIN_COVERAGE = 0.04  # less static image compared: a pose from it is chance
 _MIN_OVERLAP = 0.8  # less of the anchor in view: the next frames get a new one
 _MAX_MISSES = 5  # frames at constant velocity before the motion is unknown
@@ -86,7 +85,7 @@ class DirectEgoMotion:
         result = self._aligner.align(
             self._anchor.pyramid, current, se3.inverse(guess) @ self._anchor.T_odom_camera
         )
-        if result.inlier_ratio < self._config.min_inliers or result.coverage < _MIN_COVERAGE:
+        if result.inlier_ratio < _MIN_INLIERS or result.coverage < _MIN_COVERAGE:
             return self._coast(guess)
         self._misses = 0
         pose = self._anchor.T_odom_camera @ se3.inverse(result.T_current_reference)

@@ -29,6 +29,7 @@ from bdgs_ros.detection.ego_motion import EgoMotion
 
 _SECOND_NS = 1_000_000_000
 _KERNEL = np.ones((3, 3), np.uint8)
+_FREE_RADIUS = 2  # pixels of the comparison that registration may be off
 
 
 @dataclass(frozen=True)
@@ -137,20 +138,27 @@ class GeometricPrior:
             self._views.clear()
             self._last = None
             return np.zeros(frame.depth_m.shape, np.uint8)
-        camera = frame.camera.scaled(self._config.width / frame.camera.width)
+        now, depth_m, moving = self._look(frame, T_odom_camera, told)
+        points = now.inverse_depth.camera.unproject(depth_m)
+        self._last = self._movers(now, points, moving)
+        self._remember(now)
+        return self._paint(self._last, frame.depth_m.shape)
+
+    def _look(
+        self, frame: RgbdFrame, T_odom_camera: Pose, told: ProbabilityImage
+    ) -> tuple[View, DepthImage, Mask]:
+        """Return the frame as later ones will compare with it, its depth and what moves in it."""
+        camera = frame.camera.scaled(min(1.0, self._config.width / frame.camera.width))
         depth_m = _shrink(frame.depth_m, camera)
         moving = _shrink(told, camera) >= DYNAMIC_THRESHOLD
-        still_m = np.where(moving, np.float32(0), depth_m)
-        now = View(
+        view = View(
             frame.stamp_ns,
             T_odom_camera,
             self._way_to(T_odom_camera),
-            free_depth(depth_m, 2),
-            InverseDepth.of(still_m, camera),
+            free_depth(depth_m, _FREE_RADIUS),
+            InverseDepth.of(np.where(moving, np.float32(0), depth_m), camera),
         )
-        self._last = self._movers(now, camera.unproject(depth_m), moving)
-        self._remember(now)
-        return self._paint(self._last, frame.depth_m.shape)
+        return view, depth_m, moving
 
     def _with_last(self, prior: ProbabilityImage) -> ProbabilityImage:
         if self._last is None or not self._last.any():
@@ -168,9 +176,7 @@ class GeometricPrior:
             margin = self._margin(depth_m, gap)
             agrees = np.abs(gap) < margin
             known = np.isfinite(gap) & still
-            if np.count_nonzero(agrees & still) < self._config.min_inliers * np.count_nonzero(
-                known
-            ):
+            if (agrees & still).sum() < self._config.min_inliers * known.sum():
                 continue
             # What was in its place longer ago did not move in since: that would be misalignment.
             seeds |= (gap > margin) & ~static
@@ -200,14 +206,17 @@ class GeometricPrior:
         """The gap that noise explains: both depths are noisy, the farther one more."""
         far = depth_m + np.maximum(np.nan_to_num(gap), 0)
         sigma = self._config.depth_noise * far**2
-        return np.maximum(self._config.threshold_m, self._config.threshold_sigma * sigma)
+        return np.asarray(
+            np.maximum(self._config.threshold_m, self._config.threshold_sigma * sigma)
+        )
 
     def _way_to(self, T_odom_camera: Pose) -> NDArray[np.float64]:
         if not self._views:
             return np.zeros(2)
         last = self._views[-1]
         step = se3.log(se3.inverse(last.T_odom_camera) @ T_odom_camera)
-        return last.way + (np.linalg.norm(step[:3]), np.linalg.norm(step[3:]))
+        step_length = np.array([np.linalg.norm(step[:3]), np.linalg.norm(step[3:])])
+        return np.asarray(last.way + step_length)
 
     def _views_for(self, now: View) -> list[View]:
         """
@@ -241,7 +250,7 @@ class GeometricPrior:
 def _shrink(image: NDArray[Any], camera: PinholeCamera) -> NDArray[Any]:
     """Pick pixels; averages would mix depths."""
     size = (camera.width, camera.height)
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST_EXACT))
 
 
 def grow(seeds: Mask, static: Mask, depth_m: DepthImage, share: float, step: float = 0.03) -> Mask:

@@ -92,12 +92,14 @@ def cut_box(bins: Bins, box: Box, config: CutConfig) -> Mask:
     holes = (window == 0).astype(np.uint8)
     contrast = _depth_contrast(bins, box)
     if contrast is None:
-        return holes  # nothing in the middle has depth: very near, or seen against the sun
+        return np.asarray(
+            holes
+        )  # nothing in the middle has depth: very near, or seen against the sun
     layer, peak = _depth_layer(contrast, config)
     mask = _without_specks(layer[window])
     if _BIN_DEPTH_M[peak] < config.near:
-        return mask | _touching(holes, mask)
-    return mask | (_close(mask) & holes)
+        return np.asarray(mask | _touching(holes, mask))
+    return np.asarray(mask | (_close(mask) & holes))
 
 
 def _depth_contrast(bins: Bins, box: Box) -> NDArray[np.float64] | None:
@@ -130,7 +132,7 @@ def _depth_layer(contrast: NDArray[np.float64], config: CutConfig) -> tuple[Mask
     peak = int(contrast.argmax())
     nearest = _BIN_DEPTH_M[peak] - config.near_tolerance
     farthest = _BIN_DEPTH_M[peak] + config.far_tolerance
-    reach = (_BIN_DEPTH_M > nearest) & (_BIN_DEPTH_M < farthest)
+    reach = (nearest < _BIN_DEPTH_M) & (farthest > _BIN_DEPTH_M)
     layer = reach & (contrast > -0.1 * contrast[peak])
     layer[0] = False
     return layer.astype(np.uint8), peak
@@ -170,7 +172,8 @@ def _coarse_box(detection: Detection, shape: tuple[int, ...], step: int, margin:
     left = int(np.clip((x0 - dx) / step, 0, shape[1] - 2))
     top = int(np.clip((y0 - dy) / step, 0, shape[0] - 2))
     right = int(np.clip(np.ceil((x1 + dx) / step), left + 2, shape[1]))
-    bottom = int(np.clip(np.ceil((y1 + dy) / step), top + 2, shape[0]))
+    # Not downwards: below the feet is the floor, at the depth of the feet.
+    bottom = int(np.clip(np.ceil(y1 / step), top + 2, shape[0]))
     return left, top, right, bottom
 
 

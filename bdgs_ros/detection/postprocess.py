@@ -119,7 +119,7 @@ def to_image(boxes: Boxes, placement: Letterbox, height: int, width: int) -> Box
     """Bring boxes from pixels of the input to pixels of the image, clipped to it."""
     offset = np.array([placement.offset_x, placement.offset_y] * 2, np.float32)
     limit = np.array([width, height] * 2, np.float32)
-    return np.clip((boxes - offset) / placement.scale, 0, limit).astype(np.float32)
+    return np.asarray(np.clip((boxes - offset) / placement.scale, 0, limit), np.float32)
 
 
 def detections(

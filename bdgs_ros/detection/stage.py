@@ -93,6 +93,7 @@ class DetectionStage:
             found = self._detector.detect(frame.color)
         except ModelError as error:
             self._detector = self._give_up(error)
+            self._hold.reset()
             return []
         return self._hold.update(found, frame.camera.shape)
 

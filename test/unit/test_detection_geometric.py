@@ -1,4 +1,4 @@
-"""The class-agnostic prior: a ray-cast room with exact poses, in which a ball moves or does not."""
+"""The class-agnostic prior, in a ray-cast room in which a ball moves or does not."""
 
 from __future__ import annotations
 
@@ -67,8 +67,16 @@ def shaking(k: int) -> Pose:
     """Return a camera that turns and sways."""
     t = k / 30
     return se3.exp(
-        np.array([0.1 * np.sin(3 * t), 0.05 * np.sin(4 * t), 0, 0.1 * np.sin(5 * t),
-                  0.3 * np.sin(3 * t), 0.15 * np.sin(6 * t)])
+        np.array(
+            [
+                0.1 * np.sin(3 * t),
+                0.05 * np.sin(4 * t),
+                0,
+                0.1 * np.sin(5 * t),
+                0.3 * np.sin(3 * t),
+                0.15 * np.sin(6 * t),
+            ]
+        )
     )
 
 
@@ -107,10 +115,13 @@ def test_a_ball_that_rests_is_static_again() -> None:
 
 def test_wrong_ego_motion_gives_no_garbage() -> None:
     """When most depths disagree, the poses are wrong and not the world."""
+
     def wrong(k: int) -> Pose:
         return se3.exp(np.array([0, 0, 0.1 * k, 0, 0.0, 0]))
 
-    assert not any((p > 0).any() for p, _ in run(30, lambda k: se3.identity(), lambda k: None, wrong))
+    assert not any(
+        (p > 0).any() for p, _ in run(30, lambda k: se3.identity(), lambda k: None, wrong)
+    )
 
 
 def test_unknown_ego_motion_gives_nothing_and_starts_anew() -> None:

@@ -105,7 +105,7 @@ def test_a_file_that_is_no_network_says_so(write: Write) -> None:
 
 def test_a_missing_file_is_named() -> None:
     """With what to do about it."""
-    with pytest.raises(ModelError, match="no weights file '/nowhere/y.onnx'.*leave it empty"):
+    with pytest.raises(ModelError, match=r"no weights file '/nowhere/y\.onnx'.*leave it empty"):
         make_detector(DetectionConfig(weights='/nowhere/y.onnx'))
 
 
@@ -139,7 +139,7 @@ def test_cuda_that_is_not_there_is_an_error_only_when_demanded(write: Write) -> 
         pytest.skip('this onnxruntime has CUDA')
     config = write(tiny_network())
     make_detector(DetectionConfig(weights=config.weights, provider='auto'))
-    with pytest.raises(ModelError, match='detection.provider'):
+    with pytest.raises(ModelError, match=r'detection\.provider'):
         make_detector(DetectionConfig(weights=config.weights, provider='cuda'))
 
 

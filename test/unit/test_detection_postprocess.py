@@ -45,8 +45,9 @@ def test_letterbox_and_to_image_are_inverse(size: tuple[int, int]) -> None:
     _, placement = postprocess.letterbox(np.zeros((*size, 3), np.uint8), 320, 416)
     box = np.array([[10, 20, 70, 60]], np.float32)
     offset = np.array([placement.offset_x, placement.offset_y] * 2)
-    back = postprocess.to_image((box * placement.scale + offset).astype(np.float32),
-                                placement, *size)
+    back = postprocess.to_image(
+        (box * placement.scale + offset).astype(np.float32), placement, *size
+    )
     assert back == pytest.approx(box, abs=1e-3)
 
 
@@ -75,15 +76,15 @@ def test_suppression_is_per_class_and_keeps_the_best() -> None:
         HALF,
     )
     assert [(d.class_name, round(d.score, 2)) for d in found] == [
-        ('person', 0.9), ('chair', 0.8), ('person', 0.5)
+        ('person', 0.9),
+        ('chair', 0.8),
+        ('person', 0.5),
     ]
 
 
 def test_boxes_are_clipped_and_empty_ones_dropped() -> None:
     """What lies in the padding is not in the image."""
-    found = find(
-        output((10, 160, 100, 100, 0.9, 1, 0, 0), (160, 20, 50, 30, 0.9, 1, 0, 0)), HALF
-    )
+    found = find(output((10, 160, 100, 100, 0.9, 1, 0, 0), (160, 20, 50, 30, 0.9, 1, 0, 0)), HALF)
     assert len(found) == 1
     assert found[0].box_xyxy[0] == 0
 

@@ -55,7 +55,7 @@ class GeometricConfig:
         0.8, 'frames from before a longer way than this are not compared', unit='m', low=0.0
     )
     threshold_sigma: float = param(
-        6.0, 'nearer than free space by this', unit='sigma_z', low=1.0, high=100.0
+        9.0, 'nearer than free space by this', unit='sigma_z', low=1.0, high=100.0
     )
     threshold_m: float = param(0.06, 'and by this', unit='m', low=0.0, high=5.0)
     depth_noise: float = param(
