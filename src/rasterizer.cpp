@@ -189,8 +189,9 @@ class Rasterizer {
                (e.inverse_det > 0.0f) & (half_x < 1e6f) & (half_y < 1e6f);
     write_records(in, view, i, lanes, e, l, visible, half_x, half_y);
     if (radius != nullptr) {
-      const Lanes larger = visible ? max(half_x, half_y) : Lanes{};
-      for (int lane = 0; lane < lanes; ++lane) radius[i + lane] = larger[lane];
+      const Lanes larger = max(half_x, half_y);
+      for (int lane = 0; lane < lanes; ++lane)
+        radius[i + lane] = keys_[i + lane] == kCulled ? 0.0f : larger[lane];
     }
   }
 
@@ -223,7 +224,9 @@ class Rasterizer {
     store(fields[6], e.z);
     for (int lane = 0; lane < lanes; ++lane) {
       const size_t id = i + lane;
-      if (!visible[lane]) {
+      const float* color = in.colors + 3 * id;
+      const float blended = color[0] + color[1] + color[2] + in.p_dynamic[id];
+      if (!visible[lane] || !(std::fabs(blended) < 1e30f)) {  // one NaN would fill the tile
         keys_[id] = kCulled;
         continue;
       }
@@ -237,9 +240,9 @@ class Rasterizer {
       r.b = fields[3][lane];
       r.c = fields[4][lane];
       r.l = fields[5][lane];
-      r.red = in.colors[3 * id];
-      r.green = in.colors[3 * id + 1];
-      r.blue = in.colors[3 * id + 2];
+      r.red = color[0];
+      r.green = color[1];
+      r.blue = color[2];
       r.z = fields[6][lane];
       r.p_dynamic = in.p_dynamic[id];
     }

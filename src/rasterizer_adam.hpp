@@ -14,21 +14,21 @@
 namespace bdgs {
 
 struct AdamStep {
-  float rate, beta1, beta2, eps, correction2;  // bias correction folded into rate
+  float rate, beta1, beta2, rest1, rest2, eps, correction2;  // bias correction folded into rate
 };
 
 inline void adam_lanes(const AdamStep& s, float* p, const float* g, float* m, float* v) {
   const Lanes grad = load(g);
-  const Lanes first = s.beta1 * load(m) + (1.0f - s.beta1) * grad;
-  const Lanes second = s.beta2 * load(v) + (1.0f - s.beta2) * grad * grad;
+  const Lanes first = s.beta1 * load(m) + s.rest1 * grad;
+  const Lanes second = s.beta2 * load(v) + s.rest2 * grad * grad;
   store(m, first);
   store(v, second);
   store(p, load(p) - s.rate * first / (sqrt(second * s.correction2) + s.eps));
 }
 
 inline void adam_one(const AdamStep& s, float& p, float g, float& m, float& v) {
-  m = s.beta1 * m + (1.0f - s.beta1) * g;
-  v = s.beta2 * v + (1.0f - s.beta2) * g * g;
+  m = s.beta1 * m + s.rest1 * g;
+  v = s.beta2 * v + s.rest2 * g * g;
   p -= s.rate * m / (std::sqrt(v * s.correction2) + s.eps);
 }
 
@@ -66,6 +66,8 @@ inline void adam_step(pybind11::array_t<float, 16> params, pybind11::array_t<flo
   s.rate = static_cast<float>(corrected ? rate / (1.0 - std::pow(betas[0], step)) : rate);
   s.beta1 = static_cast<float>(betas[0]);
   s.beta2 = static_cast<float>(betas[1]);
+  s.rest1 = static_cast<float>(1.0 - betas[0]);
+  s.rest2 = static_cast<float>(1.0 - betas[1]);
   s.eps = static_cast<float>(eps);
   s.correction2 = corrected ? static_cast<float>(1.0 / (1.0 - std::pow(betas[1], step))) : 1.0f;
   const ptrdiff_t size = params.size();

@@ -88,6 +88,7 @@ class Loss {
 
  private:
   static constexpr int kRadius = 5;
+  static constexpr float kFar = 1e30f;  // infinite depth is no depth
   static constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;
 
   struct Row {
@@ -103,7 +104,7 @@ class Loss {
       window_[d] = static_cast<float>(std::exp(-d * d / 4.5) / sum);
   }
 
-  static bool usable(float depth) { return depth > 0.0f && depth < 1e30f; }
+  static bool usable(float depth) { return depth > 0.0f && depth < kFar; }
 
   void count_row(int y) {
     Row& row = rows_[y] = Row{};
@@ -129,58 +130,65 @@ class Loss {
     per_depth_ = depth_weight > 0 ? static_cast<float>(1.0 / depth_weight) : 0.0f;
   }
 
-  // L1 and depth terms, and the planes that SSIM windows run over.
-  void pixel_row(int y) {
-    const int width = layout_.width;
-    const float* weight = in_.weight + static_cast<size_t>(y) * width;
-    const float* depth = in_.depth + static_cast<size_t>(y) * width;
-    const float* target = in_.color + static_cast<size_t>(y) * width * 3;
-    float *w = plane(kWeight, y), *m = plane(kMask, y);
-    for (int x = 0; x < width; ++x) {
-      w[x] = weight[x] > 0.0f ? weight[x] : 0.0f;
-      m[x] = weight[x] > 0.0f ? 1.0f : 0.0f;
-    }
-    float l1 = 0;
-    const float l1_scale = in_.l1 * per_weight_ / 3.0f;
-    for (int c = 0; c < 3; ++c) {
-      const float* rendered = plane(kRed + c, y);
-      float *px = plane(kX + c, y), *py = plane(kY + c, y), *grad = plane(kGradRed + c, y);
-      float *ps = plane(kS + c, y), *pc = plane(kC + c, y);
-      for (int i = 0; i < width; ++i) {
-        const float t = m[i] > 0.0f ? target[3 * i + c] : 0.0f;
-        const float v = m[i] > 0.0f ? gain_ * rendered[i] + in_.offset : 0.0f;
-        const float error = v - t;
-        px[i] = v;
-        py[i] = t;
-        ps[i] = v * v + t * t;
-        pc[i] = v * t;
-        const float sign = error > 0.0f ? 1.0f : (error < 0.0f ? -1.0f : 0.0f);
-        grad[i] = l1_scale * w[i] * sign;
-      }
-      Lanes sum_error = Lanes{};  // the overhang is zero in both planes
-      for (int i = 0; i < width; i += kLanes)
-        sum_error += load(w + i) * abs(load(px + i) - load(py + i));
-      l1 += sum(sum_error);
-    }
-    rows_[y].l1 = l1 / 3.0;
-    depth_row(y, depth, w);
+  static Lanes sign(Lanes v) {
+    return v > 0.0f ? splat(1.0f) : (v < 0.0f ? splat(-1.0f) : Lanes{});
   }
 
-  void depth_row(int y, const float* depth, const float* w) {
-    const float *z = plane(kDepth, y), *s = plane(kSilhouette, y);
-    float *grad_z = plane(kGradDepth, y), *grad_s = plane(kGradSilhouette, y);
-    const float scale = in_.depth_weight * per_depth_;
-    float loss = 0;
-    for (int x = 0; x < layout_.width; ++x) {
-      const float d = usable(depth[x]) ? depth[x] : 0.0f;
-      const float use = usable(depth[x]) ? w[x] : 0.0f;
-      const float error = z[x] - s[x] * d;
-      const float sign = error > 0.0f ? 1.0f : (error < 0.0f ? -1.0f : 0.0f);
-      loss += use * std::fabs(error);
-      grad_z[x] = scale * use * sign;
-      grad_s[x] = -grad_z[x] * d;
+  // L1 and depth terms, and the planes that SSIM windows run over. Planes are zero beyond the
+  // image, and `w` too, so whole vectors may overhang.
+  void pixel_row(int y) {
+    static thread_local Buffer<float> memory;
+    const int width = layout_.width;
+    const size_t length = layout_.stride;
+    float* target = memory.reserve(4 * length);
+    float* depth = target + 3 * length;
+    std::memcpy(depth, in_.depth + static_cast<size_t>(y) * width, width * sizeof(float));
+    const float* weight = in_.weight + static_cast<size_t>(y) * width;
+    const float* pixels = in_.color + static_cast<size_t>(y) * width * 3;
+    float* w = plane(kWeight, y);
+    for (int x = 0; x < width; ++x) w[x] = weight[x] > 0.0f ? weight[x] : 0.0f;
+    for (int x = 0; x < width; ++x)
+      for (int c = 0; c < 3; ++c) target[c * length + x] = pixels[3 * x + c];
+    Lanes l1 = Lanes{}, depth_error = Lanes{};
+    for (int x = 0; x < width; x += kLanes) {
+      l1 += color_lanes(y, x, target, length);
+      depth_error += depth_lanes(y, x, load(depth + x));
     }
-    rows_[y].depth = loss;
+    rows_[y].l1 = sum(l1) / 3.0;
+    rows_[y].depth = sum(depth_error);
+  }
+
+  Lanes color_lanes(int y, int x, const float* target, size_t length) {
+    const Lanes w = load(plane(kWeight, y) + x), zero = Lanes{};
+    const Mask counts = w > 0.0f;
+    store(plane(kMask, y) + x, counts ? splat(1.0f) : zero);
+    const float scale = in_.l1 * per_weight_ / 3.0f;
+    Lanes loss = zero;
+    for (int c = 0; c < 3; ++c) {
+      const Lanes rendered = load(plane(kRed + c, y) + x);
+      const Lanes v = counts ? gain_ * rendered + in_.offset : zero;
+      const Lanes t = counts ? load(target + c * length + x) : zero;
+      store(plane(kX + c, y) + x, v);
+      store(plane(kY + c, y) + x, t);
+      store(plane(kS + c, y) + x, v * v + t * t);
+      store(plane(kC + c, y) + x, v * t);
+      store(plane(kGradRed + c, y) + x, scale * w * sign(v - t));
+      loss += w * abs(v - t);
+    }
+    return loss;
+  }
+
+  Lanes depth_lanes(int y, int x, Lanes depth) {
+    const Lanes zero = Lanes{};
+    const Lanes w = load(plane(kWeight, y) + x);
+    const Mask known = (depth > 0.0f) & (depth < kFar) & (w > 0.0f);
+    const Lanes d = known ? depth : zero, use = known ? w : zero;
+    const Lanes error = known ? load(plane(kDepth, y) + x) - load(plane(kSilhouette, y) + x) * d
+                              : zero;
+    const Lanes by_depth = (in_.depth_weight * per_depth_) * use * sign(error);
+    store(plane(kGradDepth, y) + x, by_depth);
+    store(plane(kGradSilhouette, y) + x, -by_depth * d);
+    return use * abs(error);
   }
 
   // Vertical half of the window for row y; `out` also covers the border that the other half needs.

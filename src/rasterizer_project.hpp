@@ -100,7 +100,7 @@ inline void rotation_of(const Lanes* q, Lanes* R) {
 }
 
 inline Lanes sigmoid(Lanes logit) {
-  const Lanes limited = min(max(logit, splat(-80.0f)), splat(80.0f));
+  const Lanes limited = min(splat(80.0f), max(splat(-80.0f), logit));
   return 1.0f / (1.0f + exp2(limited * -kLog2E));
 }
 
@@ -121,7 +121,7 @@ inline void project(const Parameters& in, int i, const View& view, Ellipses& e) 
   for (int k = 0; k < 4; ++k) e.quat[k] *= e.inverse_norm;
   load_rows<3>(in.log_scales, i, in.count, e.scale);
   for (int k = 0; k < 3; ++k)
-    e.scale[k] = exp2(min(max(e.scale[k] * kLog2E, splat(-40.0f)), splat(40.0f)));
+    e.scale[k] = exp2(min(splat(40.0f), max(splat(-40.0f), e.scale[k] * kLog2E)));
   load_rows<1>(in.logit_opacities, i, in.count, &e.opacity);
   e.opacity = sigmoid(e.opacity);
 

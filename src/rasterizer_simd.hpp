@@ -41,7 +41,7 @@ inline void store(float* to, Lanes v) { std::memcpy(to, &v, sizeof(v)); }
 inline Mask bits_of(Lanes v) { return reinterpret_cast<Mask>(v); }
 inline Lanes from_bits(Mask v) { return reinterpret_cast<Lanes>(v); }
 
-// NaN in either argument gives b, so a NaN never survives `min(v, limit)`.
+// NaN in either argument gives b: `min(limit, v)` lets a NaN through, `min(v, limit)` does not.
 inline Lanes min(Lanes a, Lanes b) { return a < b ? a : b; }
 inline Lanes max(Lanes a, Lanes b) { return a > b ? a : b; }
 inline Lanes abs(Lanes v) { return from_bits(bits_of(v) & 0x7fffffff); }

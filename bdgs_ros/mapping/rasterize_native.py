@@ -61,7 +61,7 @@ class NativeBackend:
         """Return derivatives, given those by color, depth and silhouette."""
         arrays = _empty_gradients(len(scene.gaussians))
         pose = self.workspace.backward(*_arguments(scene), *dL_dimages, arrays)
-        return Gradients(*arrays[:5], pose)
+        return Gradients.of(arrays[:5], pose)
 
     def fused_step(
         self, scene: Scene, target: Target, weights: LossWeights, with_images: bool
@@ -85,7 +85,7 @@ class NativeBackend:
             l1,
             ssim,
             depth,
-            Gradients(*arrays[:5], pose),
+            Gradients.of(arrays[:5], pose),
             np.array([d_log_gain, d_offset], np.float32),
             arrays[5],
             Rendered(*images) if images else None,

@@ -12,6 +12,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import conv2d
 
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.mapping.rasterize_types import (
@@ -93,7 +94,9 @@ def project(
     centre = focal * slope + offset
     opacity = torch.sigmoid(logits)
     half = _half_sizes(opacity, torch.stack([xx, yy], dim=1)).detach()
-    inside = ((centre + half >= 0) & (centre - half <= size - 1)).all(dim=1)
+    first = (centre - half).detach().ceil().clamp_min(0)  # pixel centres in the box
+    last = torch.minimum((centre + half).detach().floor(), size - 1)
+    inside = (first <= last).all(dim=1)
     visible = active & (points[:, 2] > NEAR_M) & (opacity > MIN_ALPHA) & inside
     values = [colors, z[:, None], torch.ones_like(z)[:, None], p_dynamic[:, None]]
     return Splats(
@@ -179,10 +182,11 @@ def masked_ssim(x: Tensor, y: Tensor, mask: Tensor) -> Tensor:
     """
     d = torch.arange(-SSIM_RADIUS, SSIM_RADIUS + 1, dtype=x.dtype)
     line = torch.exp(-(d**2) / (2 * SSIM_SIGMA**2))
-    window = torch.outer(line, line)[None, None] / line.sum() ** 2
+    line = (line / line.sum())[None, None]
 
     def blur(image: Tensor) -> Tensor:
-        return torch.nn.functional.conv2d(image[:, None], window, padding=SSIM_RADIUS)[:, 0]
+        across = conv2d(image[:, None], line[..., None, :], padding=(0, SSIM_RADIUS))
+        return conv2d(across, line[..., None], padding=(SSIM_RADIUS, 0))[:, 0]
 
     n = blur(mask[None]).clamp_min(1e-6)
     x, y = x * mask, y * mask
@@ -226,12 +230,13 @@ class _View:
             for k, a in enumerate(scene.gaussians.arrays())
         )
         self.xi = torch.zeros(6, dtype=torch.float64, requires_grad=True)
-        count = len(scene.gaussians)
-        active = torch.ones(count, dtype=torch.bool)
+        flat = [leaf.detach()[:, None].flatten(1) for leaf in self.leaves]
+        drawn = torch.cat(flat, dim=1).isfinite().all(dim=1)
+        params = tuple(_zero_unless(drawn, leaf) for leaf in self.leaves)
         if scene.active is not None:
-            active = torch.from_numpy(scene.active.copy())
+            drawn = drawn & torch.from_numpy(scene.active.copy())
         pose = perturbed_pose(torch.from_numpy(scene.T_camera_world.copy()), self.xi)
-        self.splats = project(self.leaves, pose, scene.camera, active)
+        self.splats = project(params, pose, scene.camera, drawn)
         self.tiles = _tiles(self.splats, scene.camera)
 
     def images(self) -> tuple[Tensor, Tensor, Tensor]:
@@ -247,9 +252,7 @@ class _View:
                 part = images[tile.rows, tile.columns]
                 part.copy_(values.reshape(part.shape))
                 total[tile.order] += weights.sum(dim=0)
-                largest[tile.order] = torch.maximum(
-                    largest[tile.order], weights.max(dim=0).values
-                )
+                largest[tile.order] = torch.maximum(largest[tile.order], weights.max(dim=0).values)
         return images, total, largest
 
     def differentiate(self, dL_dimages: Tensor) -> Gradients:
@@ -270,14 +273,18 @@ class _View:
             torch.autograd.backward(
                 [getattr(self.splats, n) for n in seen], [cut[n].grad for n in seen]
             )
-        return Gradients(*(_gradient(leaf) for leaf in self.leaves[:5]), _pose_gradient(self.xi))
+        gradients = [_gradient(leaf) for leaf in self.leaves[:5]]
+        return Gradients.of(gradients, _pose_gradient(self.xi))
+
+
+def _zero_unless(mask: Tensor, leaf: Tensor) -> Tensor:
+    return torch.where(mask.reshape(-1, *[1] * (leaf.dim() - 1)), leaf, torch.zeros_like(leaf))
 
 
 def _gradient(leaf: Tensor) -> Array:
     if leaf.grad is None:
         return np.zeros(leaf.shape, np.float32)
-    # a Gaussian behind the camera has no derivative, even if its arithmetic overflowed
-    return np.nan_to_num(leaf.grad.numpy()).astype(np.float32)
+    return np.asarray(leaf.grad.numpy(), np.float32)
 
 
 def _pose_gradient(xi: Tensor) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
@@ -309,8 +316,10 @@ class TorchBackend:
     def backward(self, scene: Scene, dL_dimages: tuple[Array, Array, Array]) -> Gradients:
         """Return derivatives, given those by color, depth and silhouette."""
         given = torch.zeros((*scene.camera.shape, 6), dtype=torch.float64)
-        for at, array in zip((_COLOR, _DEPTH, _SILHOUETTE), dL_dimages, strict=True):
-            given[..., at] = torch.from_numpy(array).to(torch.float64)
+        color, depth, silhouette = (torch.from_numpy(a).to(torch.float64) for a in dL_dimages)
+        given[..., _COLOR] = color
+        given[..., _DEPTH] = depth
+        given[..., _SILHOUETTE] = silhouette
         return _View(scene).differentiate(given)
 
     def fused_step(

@@ -71,6 +71,12 @@ class Gradients:
     pose: NDArray[np.float64]
     """[6] (rho, phi): the derivative at xi = 0 of T_camera_world <- exp(xi) T_camera_world."""
 
+    @classmethod
+    def of(cls, arrays: Sequence[Array], pose: NDArray[np.float64]) -> Gradients:
+        """Assemble from the five arrays that `parameters` returns."""
+        means, quats, log_scales, logit_opacities, colors = arrays
+        return cls(means, quats, log_scales, logit_opacities, colors, pose)
+
     def parameters(self) -> tuple[Array, Array, Array, Array, Array]:
         """Return the gradients of the optimised arrays, in the order of `Gaussians`."""
         return self.means, self.quats, self.log_scales, self.logit_opacities, self.colors
