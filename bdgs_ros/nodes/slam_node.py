@@ -55,7 +55,7 @@ class SlamNode(GraphNode):
         )
 
     def _start_graph(self) -> None:
-        values = {**self._result_files(), **self._values}
+        values = {**self._values, **self._result_files()}
         for name, kind in _GRAPH.items():
             if self._config.processes == 'several':
                 self._children.start(name, values)
@@ -63,7 +63,8 @@ class SlamNode(GraphNode):
                 module = import_module(f'bdgs_ros.nodes.{name}')
                 self._threads.start(getattr(module, kind), values)
         if self._config.bag:
-            self._children.start('replay_node', {'wait_subscribers': len(_GRAPH), **values})
+            wanted = max(len(_GRAPH), int(values.get('wait_subscribers', 0)))
+            self._children.start('replay_node', {**values, 'wait_subscribers': wanted})
 
     def _result_files(self) -> dict[str, str]:
         if not self._config.output:
