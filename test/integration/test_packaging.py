@@ -41,7 +41,7 @@ def prefix(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp('prefix')
     with zipfile.ZipFile(wheel) as archive:
         for item in archive.infolist():
-            head, _, path = item.filename.partition('.data/data/')
+            _, _, path = item.filename.partition('.data/data/')
             if path and not item.is_dir():
                 target = folder / path
                 target.parent.mkdir(parents=True, exist_ok=True)
