@@ -33,6 +33,7 @@ class _Anchor:
     pyramid: ImagePyramid
 
 
+_ITERATIONS = 8  # registration by depth alone takes the rest
 _MIN_INLIERS = 0.25  # fewer: the pose follows something that moves
 _MIN_COVERAGE = 0.04  # less static image compared: a pose from it is chance
 _MIN_OVERLAP = 0.8  # less of the anchor in view: the next frames get a new one
@@ -55,7 +56,7 @@ class DirectEgoMotion:
 
     def __init__(self, config: GeometricConfig) -> None:
         self._config = config
-        self._aligner = Aligner(AlignConfig(fine_width=config.width))
+        self._aligner = Aligner(AlignConfig(fine_width=config.width, max_iterations=_ITERATIONS))
         self.reset()
 
     def reset(self) -> None:
