@@ -36,8 +36,8 @@ class SampleGrid:
     @staticmethod
     def of(camera: PinholeCamera, shift: tuple[float, float] = (0.0, 0.0)) -> SampleGrid:
         """Return the grid through pixel centres, or `shift` (right, down) pixels beside them."""
-        x: Array = (np.arange(camera.width) + shift[0] - camera.cx) / camera.fx
-        y: Array = (np.arange(camera.height) + shift[1] - camera.cy) / camera.fy
+        x: Array = (np.arange(camera.width, dtype=np.float64) + shift[0] - camera.cx) / camera.fx
+        y: Array = (np.arange(camera.height, dtype=np.float64) + shift[1] - camera.cy) / camera.fy
         return SampleGrid(x, y, 1 / camera.fx)
 
 

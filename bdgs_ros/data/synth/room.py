@@ -53,14 +53,15 @@ class Furniture:
         *,
         faces: dict[str, Paint] | None = None,
         skip: str = '',
-        density: float = FURNITURE_DENSITY,
     ) -> None:
         """Add a box; `faces` paints some of its faces differently."""
         T = self.T_world_object
         for name, origin, u, v in box_faces(np.array(centre), np.array(size), skip):
             chosen = (faces or {}).get(name, paint)
             corner = T[:3, :3] @ origin + T[:3, 3]
-            self.quads.append(rectangle(corner, T[:3, :3] @ u, T[:3, :3] @ v, density, chosen))
+            self.quads.append(
+                rectangle(corner, T[:3, :3] @ u, T[:3, :3] @ v, FURNITURE_DENSITY, chosen)
+            )
         self.occluders.append(occluder_of_box(np.array(centre), np.array(size), T))
 
 

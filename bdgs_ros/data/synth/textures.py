@@ -177,7 +177,7 @@ def cloth(rng: np.random.Generator, height: int, width: int, rgb: Rgb) -> Textur
     elif kind == 2:
         texture[(yy // period + xx // period) % 2 == 0] *= 0.6
     elif kind == 3:
-        h, w = height // 3, width // 5
+        h, w = max(height // 3, 1), max(width // 5, 1)
         x = (width - w) // 2
         texture[h : 2 * h, x : x + w] = poster(rng, h, w)
     folds = noise(rng, height, width, 40, 3) * 0.12 + noise(rng, height, width, 3, 1) * 0.05
