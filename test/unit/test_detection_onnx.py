@@ -94,7 +94,7 @@ def test_class_names_come_from_the_file(write: Write) -> None:
     answer[0, 0] = 16, 16, 8, 8, 1.0, 0.1, 0.9
     net = tiny_network(answer=answer, names="{0: 'cart', 1: 'dog'}")
     (found,) = make_detector(write(net)).detect(np.zeros((32, 32, 3), np.uint8))
-    assert found.class_name == 'dog' and found.p_dynamic > 0.8
+    assert found.class_name == 'dog' and found.p_dynamic > 0.7
 
 
 def test_a_file_that_is_no_network_says_so(write: Write) -> None:
