@@ -6,6 +6,7 @@ import json
 import multiprocessing
 import os
 import shutil
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -190,6 +191,7 @@ _worker: FrameWorker | None = None  # of this process, set by `_start`
 
 def _start(plan: RecordingPlan, folder: Path) -> None:
     global _worker
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears it and clears up
     cv2.setNumThreads(1)
     _worker = FrameWorker(plan, folder)
 
