@@ -157,7 +157,10 @@ class FrameSource:
     def _watch(self) -> None:
         logger = self._node.get_logger()
         for change in self._watchdog.check(time.monotonic()):
-            (logger.warning if change.is_bad else logger.info)(change.text)
+            if change.is_bad:  # rclpy wants one line of code per severity
+                logger.warning(change.text)
+            else:
+                logger.info(change.text)
         silent = self._watchdog.silent()
         self._health.mark('silent', f'silent: {", ".join(silent)}' if silent else '')
         apart = (

@@ -92,10 +92,12 @@ def ros(graph: Graph, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable]:
 
         thread = threading.Thread(target=spin)
         thread.start()
-        yield node
-        stop.set()
-        thread.join()
-        node.destroy_node()
+        try:
+            yield node
+        finally:
+            stop.set()
+            thread.join()
+            node.destroy_node()
 
     yield spinning
     rclpy.shutdown(context=context)
