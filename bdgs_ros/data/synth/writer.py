@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import os
 import shutil
@@ -19,12 +18,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bdgs_ros.core import se3
-from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.errors import DatasetError
+from bdgs_ros.data.synth.lists import write_lists, write_objects
+from bdgs_ros.data.synth.plan import RecordingPlan
 from bdgs_ros.data.synth.render import FrameImages, FrameRenderer
-from bdgs_ros.data.synth.scenarios import World, make_world, scenarios
-from bdgs_ros.data.synth.scene import SceneObject
+from bdgs_ros.data.synth.scenarios import World
 from bdgs_ros.data.synth.sensor import (
     DEPTH_SCALE,
     ColorSensor,
@@ -38,67 +36,11 @@ from bdgs_ros.data.synth.truth import SynthTruth, stamp_text
 Progress = Callable[[int, int], None]
 """Called with the number of frames done and their total."""
 
-_FIRST_STAMP_NS = 1000 * 10**9
 _EXPOSURE_S = 0.012
 _METER_SIZE = 80  # width in pixels of the image that sets the exposure
 _METER_EVERY = 4  # frames
 _FOLDERS = ('rgb', 'depth')
 _TRUTH_FOLDERS = ('dynamic', 'object_id', 'static_color', 'static_depth')
-_FR3 = (640, 480, 535.4, 539.2, 320.1, 247.6)
-
-
-@dataclass(frozen=True)
-class RecordingPlan:
-    """What is recorded; equal plans give equal files."""
-
-    scenario: str
-    seed: int
-    frames: int
-    width: int
-    height: int
-    rate_hz: float
-
-    def validate(self) -> None:
-        """Raise `DatasetError` for a plan that cannot be recorded."""
-        if self.scenario not in scenarios():
-            raise DatasetError(
-                f"no scenario '{self.scenario}'; there are: {', '.join(scenarios())}"
-            )
-        if self.frames < 1 or self.seed < 0 or not 0 < self.rate_hz <= 1000:
-            raise DatasetError(
-                f'frames {self.frames}, seed {self.seed}, rate {self.rate_hz:g} Hz: expected '
-                'at least 1 frame, a seed of 0 or more and a rate in (0, 1000] Hz'
-            )
-        if min(self.width, self.height) < 32 or max(self.width, self.height) > 4096:
-            raise DatasetError(
-                f'size {self.width}x{self.height}: expected 32 to 4096 pixels each way'
-            )
-
-    @property
-    def camera(self) -> PinholeCamera:
-        """The camera of TUM freiburg3 at the size of the plan, without distortion."""
-        width, height, fx, fy, cx, cy = _FR3
-        sx, sy = self.width / width, self.height / height
-        return PinholeCamera(
-            self.width,
-            self.height,
-            fx * sx,
-            fy * sy,
-            (cx + 0.5) * sx - 0.5,
-            (cy + 0.5) * sy - 0.5,
-        )
-
-    def time_s(self, frame: int) -> float:
-        """Return the time of a frame since the first."""
-        return (self.stamp_ns(frame) - _FIRST_STAMP_NS) * 1e-9
-
-    def stamp_ns(self, frame: int) -> int:
-        """Return the stamp of a frame, a whole number of microseconds."""
-        return _FIRST_STAMP_NS + round(frame * 1e6 / self.rate_hz) * 1000
-
-    def world(self) -> World:
-        """Return the world that is recorded."""
-        return make_world(self.scenario, self.seed, self.frames / self.rate_hz)
 
 
 @dataclass(frozen=True)
@@ -152,8 +94,8 @@ class FrameWorker:
 
     def write_lists(self, gains: Sequence[float]) -> None:
         """Write everything that is not an image."""
-        _write_lists(self._plan, self.world, self._folder, gains)
-        _write_objects(self._plan, self.world, self._folder)
+        write_lists(self._plan, self.world, self._folder, gains)
+        write_objects(self._plan, self.world, self._folder)
 
     def _files(
         self,
@@ -345,68 +287,3 @@ def _replace(folder: Path, partial: Path) -> None:
     folder.rename(old)
     partial.rename(folder)
     shutil.rmtree(old)
-
-
-def _pose_row(stamp_ns: int, T: NDArray[np.float64]) -> str:
-    position, quat = se3.to_position_quat_xyzw(T)
-    return ' '.join([stamp_text(stamp_ns), *(f'{v:.9f}' for v in (*position, *quat))])
-
-
-def _write_lists(plan: RecordingPlan, world: World, folder: Path, gains: Sequence[float]) -> None:
-    stamps = [plan.stamp_ns(k) for k in range(plan.frames)]
-    for kind, title in (('rgb', 'color images'), ('depth', 'depth maps')):
-        rows = [f'{stamp_text(s)} {kind}/{stamp_text(s)}.png' for s in stamps]
-        _write_text(folder / f'{kind}.txt', [f'# {title}', '# timestamp filename', *rows])
-    path = world.camera_path
-    poses = [_pose_row(s, path.pose(plan.time_s(k))) for k, s in enumerate(stamps)]
-    header = ['# ground truth trajectory', '# timestamp tx ty tz qx qy qz qw']
-    for name in ('groundtruth.txt', 'truth/groundtruth.txt'):
-        _write_text(folder / name, header + poses)
-    rows = [f'{stamp_text(s)} {g:.6f}' for s, g in zip(stamps, gains, strict=True)]
-    _write_text(folder / 'truth/exposure.txt', ['# timestamp gain', *rows])
-    _write_text(folder / 'camera.yaml', _camera_yaml(plan.camera))
-
-
-def _camera_yaml(camera: PinholeCamera) -> list[str]:
-    rows = [(key, getattr(camera, key)) for key in ('width', 'height', 'fx', 'fy', 'cx', 'cy')]
-    return [
-        'camera:',
-        '  name: synth',
-        *(f'  {key}: {value!r}' for key, value in rows),
-        f'  distortion: {list(camera.distortion)}',
-        f'  depth_scale: {DEPTH_SCALE}',
-    ]
-
-
-def _write_text(path: Path, lines: Sequence[str]) -> None:
-    path.write_text('\n'.join(lines) + '\n')
-
-
-def _write_objects(plan: RecordingPlan, world: World, folder: Path) -> None:
-    content = {
-        'scenario': plan.scenario,
-        'seed': plan.seed,
-        'frames': plan.frames,
-        'size': [plan.width, plan.height],
-        'rate_hz': plan.rate_hz,
-        'objects': [_describe(item, plan) for item in world.scene.objects],
-    }
-    (folder / 'truth/objects.json').write_text(json.dumps(content, indent=1) + '\n')
-
-
-def _describe(item: SceneObject, plan: RecordingPlan) -> dict[str, Any]:
-    ends = (0.0, plan.frames / plan.rate_hz)  # intervals are half open
-    start = _FIRST_STAMP_NS * 1e-9
-    frames = range(plan.frames) if item.is_mover else ()
-    return {
-        'id': item.object_id,
-        'name': item.name,
-        'kind': item.kind,
-        'is_mover': item.is_mover,
-        'moving_s': [
-            [start + float(np.clip(t, *ends)) for t in interval] for interval in item.moving
-        ],
-        'poses': [
-            _pose_row(plan.stamp_ns(k), item.T_world_object(plan.time_s(k))) for k in frames
-        ],
-    }
