@@ -13,6 +13,7 @@ from bdgs_ros.cli import synth
 from bdgs_ros.core import se3
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.errors import DatasetError
+from bdgs_ros.data.camera_file import read_camera_file
 from bdgs_ros.data.synth import SynthTruth, room, scenarios, write_recording, writer
 from bdgs_ros.data.synth.raster import SampleGrid
 from bdgs_ros.data.synth.render import FrameRenderer, draw
@@ -82,9 +83,9 @@ def test_layout_is_tum_with_camera_and_truth(box_recording):
         )
         assert color.shape == (120, 160, 3) and color.dtype == np.uint8
         assert depth.shape == (120, 160) and depth.dtype == np.uint16
-    text = (box_recording / 'camera.yaml').read_text()
-    assert text.startswith('camera:\n') and '  depth_scale: 5000\n' in text
-    assert '  distortion: [0.0, 0.0, 0.0, 0.0, 0.0]\n' in text
+    recorded = read_camera_file(box_recording / 'camera.yaml')
+    assert recorded.camera.shape == (120, 160) and recorded.camera.is_rectified
+    assert recorded.camera.fx == pytest.approx(535.4 / 4) and recorded.depth_scale == 5000
     ground_truth = np.loadtxt(box_recording / 'groundtruth.txt')
     assert ground_truth.shape == (10, 8)
     np.testing.assert_allclose(ground_truth[:, 0] * 1e9, stamps, atol=1e3)

@@ -43,8 +43,8 @@ def write_lists(plan: RecordingPlan, world: World, folder: Path, gains: Sequence
 def _camera_yaml(camera: PinholeCamera) -> list[str]:
     rows = [(key, getattr(camera, key)) for key in ('width', 'height', 'fx', 'fy', 'cx', 'cy')]
     return [
+        '# made by bdgs synth',
         'camera:',
-        '  name: synth',
         *(f'  {key}: {value!r}' for key, value in rows),
         f'  distortion: {list(camera.distortion)}',
         f'  depth_scale: {DEPTH_SCALE}',
