@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from bdgs_ros.core import se3
 from bdgs_ros.core.config import BdgsConfig, specs
 from bdgs_ros.core.errors import ConfigError
 from bdgs_ros.core.types import StampedPose, Trajectory
+from bdgs_ros.data import layouts
 from bdgs_ros.data.trajectory_io import write_trajectory
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -148,11 +151,10 @@ def test_config_lists_every_parameter_with_its_range(capsys):
 
 
 def test_run_writes_results_and_prints_them(monkeypatch, tmp_path, capsys):
-    import bdgs_ros.pipeline
-    from bdgs_ros.data import layouts
-
+    pipeline = ModuleType('bdgs_ros.pipeline')
+    pipeline.BdgsSlam = lambda config: FakeSlam()
+    monkeypatch.setitem(sys.modules, 'bdgs_ros.pipeline', pipeline)
     monkeypatch.setattr(layouts, 'open_sequence', lambda *_, **__: FakeSequence(20))
-    monkeypatch.setattr(bdgs_ros.pipeline, 'BdgsSlam', lambda config: FakeSlam())
     words = ['run', str(tmp_path / 'seq'), '--output', str(tmp_path / 'out')]
     assert main.main([*words, '--start', '4', '--frames', '10', '--no-pictures', '--json']) == 0
     found = json.loads(capsys.readouterr().out)
