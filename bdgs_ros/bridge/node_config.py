@@ -71,6 +71,7 @@ class GraphConfig:
 class DetectionNodeConfig(GraphConfig):
     """Parameters of detection_node."""
 
+    detection_nice: int = param(5, 'how much the detector gives way to tracking', low=0, high=19)
     detection: DetectionConfig = field(default_factory=DetectionConfig)
 
 
@@ -108,6 +109,7 @@ class MappingNodeConfig(GraphConfig):
         2, 'keyframes that may wait for mapping (realtime)', low=1, high=1000
     )
     frame_buffer: int = param(60, 'frames kept until their keyframe arrives', low=2, high=10000)
+    mapping_nice: int = param(10, 'how much mapping gives way to tracking', low=0, high=19)
     mapping: MappingConfig = field(default_factory=MappingConfig)
     belief: BeliefConfig = field(default_factory=BeliefConfig)
 

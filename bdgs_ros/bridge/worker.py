@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import threading
 import time
 from collections import deque
@@ -28,6 +30,8 @@ class Worker(Generic[Item]):
         Called after every item and `idle_period_s` after the last call while nothing is to do.
     idle_period_s : float
         See `idle`.
+    nice : int
+        How much the thread, and those it starts, give way to others (Linux).
 
     """
 
@@ -38,6 +42,7 @@ class Worker(Generic[Item]):
         capacity: int | None,
         idle: Callable[[], None] = lambda: None,
         idle_period_s: float = 0.1,
+        nice: int = 0,
     ) -> None:
         self.dropped = 0
         self._handle = handle
@@ -45,6 +50,7 @@ class Worker(Generic[Item]):
         self._capacity = capacity
         self._idle = idle
         self._idle_period_s = idle_period_s
+        self._nice = nice
         self._items: deque[Item] = deque()
         self._first: Callable[[], None] | None = None
         self._changed = threading.Condition()
@@ -89,6 +95,8 @@ class Worker(Generic[Item]):
         self._thread.join(timeout_s)
 
     def _run(self) -> None:
+        if self._nice and sys.platform.startswith('linux'):  # elsewhere it is per process
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), self._nice)
         while not self._stopping:
             call = self._next()
             if call is not None:

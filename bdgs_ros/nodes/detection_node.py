@@ -35,7 +35,10 @@ class DetectionNode(GraphNode):
         self._decoder = FrameDecoder.of(self)
         # Only the newest image is worth a detector's time; in lockstep, all are.
         self._worker: Worker[RawFrame] = Worker(
-            self._on_frame, self._on_error, None if config.lockstep else 1
+            self._on_frame,
+            self._on_error,
+            None if config.lockstep else 1,
+            nice=config.detection_nice,
         )
         self._source = FrameSource(self, config, self._health, self._worker.put, self._reset)
         self.create_subscription(

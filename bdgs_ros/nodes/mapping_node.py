@@ -63,6 +63,7 @@ class MappingNode(GraphNode):
             self._on_error,
             None if config.lockstep else config.keyframe_queue,
             self._on_idle,
+            nice=config.mapping_nice,
         )
         self._load_at_start()
         self._subscribe()
