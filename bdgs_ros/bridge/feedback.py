@@ -104,6 +104,8 @@ class Feedback:
         """Remember a keyframe's pose: its model view comes back with its stamp only."""
         if not result.is_keyframe:
             return
+        mapped = self._node.count_publishers(topics.MODEL_IMAGE) > 0
+        self._health.mark('mapping', '' if mapped else 'no mapping: frame to keyframe only')
         self._keyframes[result.stamp_ns] = (result.T_world_camera, camera)
         while len(self._keyframes) > _KEYFRAMES_KEPT:
             self._keyframes.popitem(last=False)

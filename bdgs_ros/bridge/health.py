@@ -71,6 +71,13 @@ class Health:
         else:
             self._problems.pop(key, None)
 
+    def error(self, error: Exception) -> None:
+        """Note an error that nobody expected; the node goes on."""
+        if not self._node.context.ok():  # it is going down: publishing fails, and that is fine
+            return
+        self.counts['errors'] += 1
+        self.set_problem('error', f'{type(error).__name__}: {error}')
+
     def warn(self, text: str) -> None:
         """Log a warning; the same text at most twice a minute."""
         now = time.monotonic()
@@ -95,7 +102,7 @@ class Health:
     def _values(self) -> dict[str, str]:
         values = {key: str(count) for key, count in sorted(self.counts.items())}
         for name, timings in list(self._timings_ms.items()):
-            measured = np.array(timings)
+            measured = np.array(list(timings))  # one step, while another thread appends
             values[f'{name}_ms_median'] = f'{np.median(measured):.2f}'
             values[f'{name}_ms_p95'] = f'{np.percentile(measured, 95):.2f}'
         return values

@@ -39,7 +39,7 @@ class SyncConfig:
         0.03, 'colour and depth further apart are no pair', unit='s', low=0.0, high=1.0
     )
     jump_back_s: float = param(
-        1.0, 'stamps that jump back further reset everything', unit='s', low=0.0
+        0.5, 'stamps that jump back further reset everything', unit='s', low=0.0
     )
 
 

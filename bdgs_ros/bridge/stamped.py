@@ -34,6 +34,11 @@ class StampBuffer(Generic[Item]):
                 self._items.popitem(last=False)
             self._changed.notify_all()
 
+    def get(self, stamp_ns: int) -> Item | None:
+        """Return the item of exactly this stamp, if it is here."""
+        with self._changed:
+            return self._items.get(stamp_ns)
+
     def wait(self, stamp_ns: int, timeout_s: float) -> Item | None:
         """Return the item of exactly this stamp; None when it has not come in time."""
         deadline = time.monotonic() + timeout_s

@@ -36,7 +36,7 @@ class DetectionNode(GraphNode):
         # Only the newest image is worth a detector's time; in lockstep, all are.
         self._worker: Worker[RawFrame] = Worker(
             self._on_frame,
-            self._on_error,
+            self._health.error,
             None if config.lockstep else 1,
             nice=config.detection_nice,
         )
@@ -57,7 +57,7 @@ class DetectionNode(GraphNode):
             with self._health.timed('detection'):
                 labels = self._stage.process(frame)
         except Exception as error:  # the prior is a help, not a must: nobody waits in vain
-            self._on_error(error)
+            self._health.error(error)
             labels = Labels(raw.stamp_ns, np.zeros(frame.camera.shape, np.uint8))
         weights = self._stage.status if self._stage.degraded else ''
         self._health.set_problem('detector', weights)
@@ -69,10 +69,6 @@ class DetectionNode(GraphNode):
         self._detections.publish(labels, head)
         self._health.counts['labels'] += 1
         self._health.counts['frames_dropped'] = self._worker.dropped
-
-    def _on_error(self, error: Exception) -> None:
-        self._health.counts['errors'] += 1
-        self._health.set_problem('error', f'{type(error).__name__}: {error}')
 
     def _reset(self) -> None:
         self._worker.restart(self._stage.reset)

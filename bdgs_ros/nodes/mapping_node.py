@@ -58,9 +58,9 @@ class MappingNode(GraphNode):
         self._viewpoint: Viewpoint | None = None
         self._pose: PoseStamped | None = None
         self._frame: tuple[RgbdFrame, str] | None = None
-        self._worker: Worker[PoseStamped] = Worker(
+        self._worker: Worker[tuple[PoseStamped, RawFrame | None]] = Worker(
             self._on_keyframe,
-            self._on_error,
+            self._health.error,
             None if config.lockstep else config.keyframe_queue,
             self._on_idle,
             nice=config.mapping_nice,
@@ -80,7 +80,9 @@ class MappingNode(GraphNode):
             lambda message: self._labels.put(conversions.stamp_ns(message), message),
             topics.RELIABLE,
         )
-        self.create_subscription(PoseStamped, topics.KEYFRAME, self._worker.put, topics.RELIABLE)
+        self.create_subscription(
+            PoseStamped, topics.KEYFRAME, self._queue_keyframe, topics.RELIABLE
+        )
         self.create_subscription(PoseStamped, topics.POSE, self._keep_pose, topics.RELIABLE)
         self.create_subscription(
             Empty, topics.RESET_EVENT, lambda _: self._forget(), topics.RELIABLE
@@ -99,15 +101,20 @@ class MappingNode(GraphNode):
     def _keep_pose(self, message: PoseStamped) -> None:
         self._pose = message
 
-    def _on_keyframe(self, message: PoseStamped) -> None:
+    def _queue_keyframe(self, message: PoseStamped) -> None:
+        # Its images are taken along now: they may be forgotten when its turn comes.
+        self._worker.put((message, self._frames.get(conversions.stamp_ns(message))))
+
+    def _on_keyframe(self, item: tuple[PoseStamped, RawFrame | None]) -> None:
+        message, raw = item
         stamp_ns = conversions.stamp_ns(message)
         view = None
         try:
-            keyframe = self._assemble(stamp_ns, message)
+            keyframe = self._assemble(message, raw or self._wait_frame(stamp_ns))
             if keyframe is not None:
                 view = self._map(keyframe)
         except BdgsError as error:
-            self._on_error(error)
+            self._health.error(error)
         finally:  # an empty answer tells tracking not to wait
             self._models.publish(stamp_ns, view)
         self._health.counts['gaussians'] = len(self._mapper.map)
@@ -120,9 +127,11 @@ class MappingNode(GraphNode):
         self._health.counts['keyframes'] += 1
         return view
 
-    def _assemble(self, stamp_ns: int, message: PoseStamped) -> Keyframe | None:
+    def _wait_frame(self, stamp_ns: int) -> RawFrame | None:
         timeout_s = self._config.lockstep_timeout_s if self._config.lockstep else _FRAME_WAIT_S
-        raw = self._frames.wait(stamp_ns, timeout_s)
+        return self._frames.wait(stamp_ns, timeout_s)
+
+    def _assemble(self, message: PoseStamped, raw: RawFrame | None) -> Keyframe | None:
         if raw is None:
             self._health.counts['keyframes_without_frame'] += 1
             self._health.warn('a keyframe was announced whose images never came; it is left out')
@@ -165,10 +174,6 @@ class MappingNode(GraphNode):
             frame.camera.scaled(width / frame.camera.width),
             frame_id,
         )
-
-    def _on_error(self, error: Exception) -> None:
-        self._health.counts['errors'] += 1
-        self._health.set_problem('error', f'{type(error).__name__}: {error}')
 
     def _forget(self) -> None:
         self._frames.clear()

@@ -44,7 +44,7 @@ class TrackingNode(GraphNode):
         self._feedback = Feedback(self, config, self._health)
         self._decoder = FrameDecoder.of(self)
         self._worker: Worker[RawFrame] = Worker(
-            self._on_frame, self._on_error, None if config.lockstep else config.frame_queue
+            self._on_frame, self._health.error, None if config.lockstep else config.frame_queue
         )
         serve_trigger(self, topics.RESET, self._on_reset)
         serve_switch(self, topics.PAUSE, self._on_pause)
@@ -104,10 +104,6 @@ class TrackingNode(GraphNode):
         self._health.counts[f'frames_{status.state.value}'] += 1
         self._health.counts['frames_dropped'] = self._worker.dropped
         self._status.publish(status_to_message(status, raw.color.header.frame_id))
-
-    def _on_error(self, error: Exception) -> None:
-        self._health.counts['errors'] += 1
-        self._health.set_problem('error', f'{type(error).__name__}: {error}')
 
     def _forget(self) -> None:
         """Start over: the next frame is the origin of the world."""
