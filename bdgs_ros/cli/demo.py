@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import shlex
 import shutil
 import subprocess
@@ -15,13 +16,13 @@ from typing import Any
 from bdgs_ros.cli.config import load_config, with_weights
 from bdgs_ros.cli.report import write_page
 from bdgs_ros.core.errors import BdgsError
-from bdgs_ros.eval.metric import dump_json
+from bdgs_ros.eval.metric import dump_json, format_value
 
 NAME = 'demo'
 HELP = 'make a recording, convert it, replay it over DDS through the graph, write a report'
 
 _MADE = ('recording', 'bag')  # folders that are made anew
-_NODE_TIMEOUT_S = 600
+_STEP_TIMEOUT_S = 600
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -50,8 +51,9 @@ def run(arguments: argparse.Namespace) -> int:
     config = with_weights(load_config(arguments), arguments.weights)
     _say('scoring and drawing')
     metrics = rescore(folder, folder / 'recording', config)
-    facts['figures and pictures'] = f'bdgs report  ({time.perf_counter() - started:.0f} s)'
-    write_page(folder, metrics, facts)
+    scored = f'bdgs report {folder} --recording {folder / "recording"}'
+    facts['figures and pictures'] = f'{scored}  ({time.perf_counter() - started:.0f} s)'
+    write_page(folder, metrics, facts, f'bdgs_ros demo: {arguments.scenario}')
     sys.stdout.write(dump_json(metrics) + '\n' if arguments.json else _summary(folder, metrics))
     return 0
 
@@ -63,8 +65,8 @@ def _commands(arguments: argparse.Namespace) -> list[tuple[str, list[str]]]:
     synth = [*bdgs, 'synth', recording, '--scenario', arguments.scenario]
     synth += ['--seed', str(arguments.seed), '--frames', str(arguments.frames)]
     parameters = {
-        'bag': str(Path(bag).resolve()),
-        'output': str(folder.resolve()),
+        'bag': bag,
+        'output': str(folder),
         'exit_at_end': 'true',
         'mode': 'lockstep',
     }
@@ -84,10 +86,13 @@ def _step(title: str, command: Sequence[str]) -> float:
     """Run one command with its output on stderr; returns its seconds."""
     _say(f'{title}: {_shown(command)}')
     start = time.perf_counter()
+    env = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', **os.environ}  # not the whole network
     try:
-        done = subprocess.run(command, stdout=sys.stderr, timeout=_NODE_TIMEOUT_S, check=False)
+        done = subprocess.run(
+            command, stdout=sys.stderr, timeout=_STEP_TIMEOUT_S, env=env, check=False
+        )
     except subprocess.TimeoutExpired as error:
-        raise BdgsError(f'{title}: not done after {_NODE_TIMEOUT_S} s') from error
+        raise BdgsError(f'{title}: not done after {_STEP_TIMEOUT_S} s') from error
     if done.returncode:
         raise BdgsError(f'{title}: exit code {done.returncode} of {_shown(command)}')
     return time.perf_counter() - start
@@ -107,8 +112,8 @@ def _summary(folder: Path, metrics: Mapping[str, Any]) -> str:
     found = metrics['metrics']
     shown = ('coverage', 'ate_rmse', 'psnr', 'gaussians')
     figures = ', '.join(
-        f'{name} {found[name]["value"]:.4g} {found[name]["unit"]}'.rstrip()
+        f'{name} {format_value(found[name]["value"])} {found[name]["unit"]}'.rstrip()
         for name in shown
-        if name in found and found[name]['value'] is not None
+        if name in found
     )
     return f"{figures}\nopen '{folder / 'report.html'}'\n"

@@ -69,7 +69,9 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def write_page(folder: Path, metrics: Mapping[str, Any], facts: Mapping[str, str]) -> None:
+def write_page(
+    folder: Path, metrics: Mapping[str, Any], facts: Mapping[str, str], title: str = ''
+) -> None:
     """
     Write `report.html` into a folder of results.
 
@@ -81,6 +83,8 @@ def write_page(folder: Path, metrics: Mapping[str, Any], facts: Mapping[str, str
         The content of `metrics.json`.
     facts : mapping of str to str
         How the results were made; commit and machine are added.
+    title : str
+        By default the name of the recording.
 
     """
     found = metrics['metrics']
@@ -97,7 +101,7 @@ def write_page(folder: Path, metrics: Mapping[str, Any], facts: Mapping[str, str
         Picture(folder / 'trajectory.png', 'The path, and the error of every frame.'),
         Picture(folder / 'tiles.png', 'Some frames of the animation.'),
     ]
-    title = f'bdgs_ros: {metrics["sequence"]}'
+    title = title or f'bdgs_ros: {metrics["sequence"]}'
     facts = {**facts, **_origin(metrics['provenance'])}
     write_report(folder / 'report.html', Report(title, _LEAD, rows, pictures, facts))
 
