@@ -6,30 +6,23 @@ import ctypes
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable
-from typing import Protocol
 
 import rclpy
-from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.logging import get_logger
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 
 from bdgs_ros.bridge import transport
 from bdgs_ros.core.errors import BdgsError
 
 PARENT_VARIABLE = 'BDGS_PARENT_PID'
 _PR_SET_PDEATHSIG = 1
+_SPIN_S = 0.1
 REFUSED = 2
 """Exit status when parameters or inputs were refused."""
-
-
-class Runnable(Protocol):
-    """What `run` needs of a node beyond rclpy's own."""
-
-    exit_code: int
-
-    def close(self) -> None:
-        """Stop threads and child processes."""
 
 
 class GraphNode(Node):
@@ -75,28 +68,40 @@ def run(
 
     """
     follow_parent()
+    stop = _catch_signals()
     transport.configure()
-    rclpy.init(args=args if args is not None else sys.argv)
+    rclpy.init(
+        args=args if args is not None else sys.argv,
+        signal_handler_options=SignalHandlerOptions.NO,
+    )
     node: GraphNode | None = None
     try:
         node = factory()
         executor = make_executor()
         executor.add_node(node)
-        while rclpy.ok() and not node.finished:
-            executor.spin_once(timeout_sec=0.5)
+        while not (node.finished or stop.is_set()):
+            executor.spin_once(timeout_sec=_SPIN_S)
         return node.exit_code
-    except (KeyboardInterrupt, ExternalShutdownException):
-        return 0
     except BdgsError as error:
         get_logger('bdgs_ros').fatal(str(error))
         return REFUSED
     finally:
-        # launch and the terminal may both signal: a second one must not break the shutdown
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
         if node is not None:
             node.close()
         rclpy.try_shutdown()
+
+
+def _catch_signals() -> threading.Event:
+    """
+    Return an event that SIGINT and SIGTERM set, instead of rclpy's own handlers.
+
+    Those shut the context down under the feet of callbacks and threads that still publish. A
+    second signal, when launch and the terminal both send one, changes nothing.
+    """
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    return stop
 
 
 def follow_parent() -> None:
