@@ -28,17 +28,42 @@ class AlignConfig:
     """Direct RGB-D alignment, coarse to fine."""
 
     max_iterations: int = param(20, 'Gauss-Newton iterations over all levels', low=1, high=200)
-    coarse_width: int = param(80, 'image width of the coarsest level', unit='px', low=20, high=640)
+    coarse_width: int = param(40, 'image width of the coarsest level', unit='px', low=20, high=640)
     fine_width: int = param(320, 'image width of the finest level', unit='px', low=20, high=1280)
-    huber_intensity: float = param(
-        0.04, 'residual where the kernel turns robust', unit='grey level in [0, 1]', low=1e-4
+    stop_px: float = param(
+        0.05, 'a level ends when points at 1 m move less in a step', unit='px', low=1e-6, high=10.0
     )
-    huber_depth_sigma: float = param(
-        2.0, 'residual where the kernel turns robust', unit='sigma_z', low=0.1
+    dof: float = param(
+        5.0, 'degrees of freedom of the t-distribution: fewer reject more', low=1.0, high=100.0
+    )
+    intensity_noise: float = param(
+        0.01, 'least scale of colour residuals', unit='grey level in [0, 1]', low=1e-4, high=1.0
+    )
+    pixel_noise: float = param(
+        0.2, 'error of the warp, times the gradient', unit='px', low=0.0, high=10.0
     )
     depth_noise: float = param(
-        0.0025, 'sigma_z = depth_noise * z^2, the Kinect model', unit='1/m', low=1e-5
+        0.0025, 'sigma_z = depth_noise * z^2, the Kinect model', unit='1/m', low=1e-5, high=1.0
     )
+    depth_weight: float = param(
+        0.5, 'of depth against colour, beyond their noise', low=0.0, high=100.0
+    )
+    pattern_sigma: float = param(
+        0.03, 'bend of the depth image that is the sensor', unit='1/m', low=1e-6, high=10.0
+    )
+    correlated_pixels: float = param(
+        100.0, 'pixels that err together; scales the covariance', low=1.0, high=1e6
+    )
+    inlier_intensity: float = param(
+        0.08, 'colour agrees within this', unit='grey level in [0, 1]', low=1e-3, high=1.0
+    )
+    inlier_depth_sigma: float = param(
+        6.0, 'depth agrees within this', unit='sigma_z', low=0.1, high=1000.0
+    )
+    min_static: float = param(
+        0.25, 'P(static) of both pixels together to count as compared', low=0.0, high=1.0
+    )
+    backend: str = param('auto', 'kernel', choices=('auto', 'native', 'numpy'))
 
 
 @dataclass(frozen=True)

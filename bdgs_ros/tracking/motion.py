@@ -1,0 +1,185 @@
+"""
+Where the camera will be: a constant-velocity Kalman filter on SE(3), section 3.1 of the paper.
+
+The state is a pose with a body velocity `nu = (v, w)`; between frames the camera follows the
+screw motion `T <- T exp(nu dt)`. The filter is an error-state one: its twelve numbers are the
+pose error `xi` in the camera's tangent, `T_true = T exp(xi)`, and the velocity. The pose error is
+zero after every update, when it is folded into the pose.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+from filterpy.kalman import KalmanFilter
+from numpy.typing import NDArray
+
+from bdgs_ros.core import se3
+from bdgs_ros.core.config.tracking import MotionConfig
+from bdgs_ros.core.types import Pose
+
+_log = logging.getLogger(__name__)
+
+Matrix = NDArray[np.float64]
+
+_START_SPEED = 1.0  # m/s, standard deviation of the velocity while nothing is known
+_START_SPIN = 2.0  # rad/s
+_LEAST_VARIANCE = 1e-10  # of a measurement, so that the innovation can be inverted
+
+
+@dataclass(frozen=True)
+class _State:
+    stamp_ns: int
+    T_world_camera: Pose
+    velocity: Matrix
+    """Shape (6,): (v, w) in the camera's frame, m/s and rad/s."""
+    covariance: Matrix
+    """Shape (12, 12): of (xi, nu)."""
+
+
+class MotionPredictor:
+    """
+    Predicts the camera pose from those measured before.
+
+    Parameters
+    ----------
+    config : MotionConfig
+        Accelerations expected; with `enabled` false the prediction is the last pose.
+
+    """
+
+    def __init__(self, config: MotionConfig) -> None:
+        self._config = config
+        self._state: _State | None = None
+
+    def reset(self) -> None:
+        """Forget pose and velocity."""
+        self._state = None
+
+    def predict(self, stamp_ns: int) -> tuple[Pose, Matrix]:
+        """
+        Say where the camera will be; changes nothing.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            Later than the last update.
+
+        Returns
+        -------
+        T_world_camera : ndarray, shape (4, 4)
+            The prediction; identity before the first update.
+        covariance : ndarray, shape (6, 6)
+            Of `xi` in `T_world_camera @ exp(xi)`: m^2, then rad^2.
+
+        Raises
+        ------
+        ValueError
+            If the stamp is not later than the last update.
+
+        """
+        if self._state is None:
+            return se3.identity(), self._start_covariance()[:6, :6]
+        moved = self._propagate(self._state, stamp_ns)
+        return moved.T_world_camera, moved.covariance[:6, :6]
+
+    def update(self, stamp_ns: int, T_world_camera: Pose, covariance: Matrix) -> None:
+        """
+        Take a measured pose; one that is far off the prediction starts the velocity anew.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            Later than the last one.
+        T_world_camera : ndarray, shape (4, 4)
+            As measured.
+        covariance : ndarray, shape (6, 6)
+            Of `xi` in `T_world_camera @ exp(xi)`: m^2, then rad^2.
+
+        Raises
+        ------
+        ValueError
+            If the stamp is not later than the last one.
+
+        """
+        measured = se3.orthonormalise(T_world_camera)
+        noise = covariance + _LEAST_VARIANCE * np.eye(6)
+        if self._state is None:
+            self._state = self._start(stamp_ns, measured, noise)
+            return
+        predicted = self._propagate(self._state, stamp_ns)
+        innovation = se3.log(se3.inverse(predicted.T_world_camera) @ measured)
+        if self._is_outside(innovation, predicted.covariance[:6, :6] + noise):
+            self._state = self._start(stamp_ns, measured, noise)
+            return
+        self._state = self._correct(predicted, innovation, noise)
+
+    def _start(self, stamp_ns: int, T_world_camera: Pose, noise: Matrix) -> _State:
+        covariance = self._start_covariance()
+        covariance[:6, :6] = noise
+        return _State(stamp_ns, T_world_camera, np.zeros(6), covariance)
+
+    def _start_covariance(self) -> Matrix:
+        spread = [_START_SPEED**2] * 3 + [_START_SPIN**2] * 3
+        return np.diag(np.array(spread * 2))
+
+    def _propagate(self, state: _State, stamp_ns: int) -> _State:
+        """Move along the screw; the pose error turns with the camera, and noise is added."""
+        if stamp_ns <= state.stamp_ns:
+            raise ValueError(
+                f'stamp_ns: expected later than {state.stamp_ns}, received {stamp_ns}; '
+                'call reset() after a jump back in time'
+            )
+        dt = (stamp_ns - state.stamp_ns) * 1e-9
+        if not self._config.enabled:
+            noise = self._start_covariance() * dt**2
+            return _State(stamp_ns, state.T_world_camera, np.zeros(6), state.covariance + noise)
+        step = se3.exp(state.velocity * dt)
+        F = np.eye(12)
+        F[:6, :6] = adjoint(se3.inverse(step))
+        F[:6, 6:] = dt * np.eye(6)
+        covariance = F @ state.covariance @ F.T + self._process_noise(dt)
+        pose = se3.orthonormalise(state.T_world_camera @ step)
+        return _State(stamp_ns, pose, state.velocity, covariance)
+
+    def _process_noise(self, dt: float) -> Matrix:
+        """Return the noise of an acceleration that is constant over the step but unknown."""
+        linear = self._config.acceleration_sigma
+        angular = self._config.angular_acceleration_sigma
+        push = np.vstack([0.5 * dt**2 * np.eye(6), dt * np.eye(6)])
+        return np.asarray(push @ np.diag([linear**2] * 3 + [angular**2] * 3) @ push.T)
+
+    def _is_outside(self, innovation: Matrix, covariance: Matrix) -> bool:
+        squared = float(innovation @ np.linalg.solve(covariance, innovation))
+        outside = squared > self._config.gate_sigma**2
+        if outside and self._config.enabled:
+            _log.info(
+                'pose is %.1f sigma off its prediction (%.3f m, %.1f deg); velocity starts anew',
+                np.sqrt(squared),
+                np.linalg.norm(innovation[:3]),
+                np.rad2deg(np.linalg.norm(innovation[3:])),
+            )
+        return outside
+
+    def _correct(self, predicted: _State, innovation: Matrix, noise: Matrix) -> _State:
+        """Update with filterpy, then fold the pose error into the pose."""
+        kalman = KalmanFilter(dim_x=12, dim_z=6)
+        kalman.x = np.concatenate([np.zeros(6), predicted.velocity])
+        kalman.P = predicted.covariance
+        kalman.H = np.hstack([np.eye(6), np.zeros((6, 6))])
+        kalman.update(innovation, R=noise)
+        pose = se3.orthonormalise(predicted.T_world_camera @ se3.exp(kalman.x[:6]))
+        velocity = kalman.x[6:] if self._config.enabled else np.zeros(6)
+        covariance = 0.5 * (kalman.P + kalman.P.T)
+        return _State(predicted.stamp_ns, pose, velocity, covariance)
+
+
+def adjoint(T_a_b: Pose) -> Matrix:
+    """Return the matrix, shape (6, 6), that takes tangents of b to a: `T exp(x) = exp(Ad x) T`."""
+    rotation = T_a_b[:3, :3]
+    out = np.zeros((6, 6))
+    out[:3, :3] = out[3:, 3:] = rotation
+    out[:3, 3:] = se3.hat(T_a_b[:3, 3]) @ rotation
+    return out
