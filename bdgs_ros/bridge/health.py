@@ -11,12 +11,14 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
+from rclpy.duration import Duration
 from rclpy.node import Node
 
 from bdgs_ros.bridge import topics
 
 _PERIOD_S = 1.0
 _REPEAT_S = 30.0
+_LAST_S = 2.0
 _KEPT_TIMINGS = 20000
 
 
@@ -98,6 +100,11 @@ class Health:
         message = DiagnosticArray(status=[status])
         message.header.stamp = stamp
         self._publisher.publish(message)
+
+    def publish_last(self) -> None:
+        """Send the status before the node goes, and wait until it has arrived."""
+        self.publish()
+        self._publisher.wait_for_all_acked(Duration(seconds=_LAST_S))
 
     def _values(self) -> dict[str, str]:
         values = {key: str(count) for key, count in sorted(self.counts.items())}

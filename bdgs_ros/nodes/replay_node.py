@@ -201,8 +201,7 @@ class ReplayNode(GraphNode):
         self._health.counts['frames_missed_by_tracking'] = acks.missed
         if acks.missed:
             self._raw.wait_delivered(_QUIET_S)
-        self._health.publish()
-        time.sleep(_POLL_S)
+        self._health.publish_last()
 
     def _on_pause(self, paused: bool) -> str:
         if paused:
