@@ -11,14 +11,12 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
-from rclpy.duration import Duration
 from rclpy.node import Node
 
 from bdgs_ros.bridge import topics
 
 _PERIOD_S = 1.0
 _REPEAT_S = 30.0
-_LAST_S = 2.0
 _KEPT_TIMINGS = 20000
 
 
@@ -94,19 +92,15 @@ class Health:
             name=f'bdgs_ros: {self._name}',
             message='; '.join(self._problems.values()) or 'ok',
             hardware_id=self._node.get_fully_qualified_name(),
-            values=[KeyValue(key=key, value=value) for key, value in self._values().items()],
+            values=[KeyValue(key=key, value=value) for key, value in self.values().items()],
         )
         stamp = self._node.get_clock().now().to_msg()
         message = DiagnosticArray(status=[status])
         message.header.stamp = stamp
         self._publisher.publish(message)
 
-    def publish_last(self) -> None:
-        """Send the status before the node goes, and wait until it has arrived."""
-        self.publish()
-        self._publisher.wait_for_all_acked(Duration(seconds=_LAST_S))
-
-    def _values(self) -> dict[str, str]:
+    def values(self) -> dict[str, str]:
+        """Return counts and timings, as the status carries them."""
         values = {key: str(count) for key, count in sorted(self.counts.items())}
         for name, timings in list(self._timings_ms.items()):
             measured = np.array(list(timings))  # one step, while another thread appends

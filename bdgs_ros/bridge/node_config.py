@@ -130,6 +130,7 @@ class ReplayConfig(GraphConfig):
     wait_timeout_s: float = param(
         30.0, 'then start anyway, with a warning', unit='s', low=0.0, high=3600.0
     )
+    report_file: str = param('', 'where the counts go at the end, as JSON; empty: nowhere')
     color_topic: str = param('', 'colour topic in the bag; empty: found by its name')
     depth_topic: str = param('', 'depth topic in the bag; empty: found by its name')
     info_topic: str = param('', 'camera_info topic in the bag; empty: found by its name')

@@ -78,6 +78,10 @@ class Children:
         default_factory=lambda: tempfile.TemporaryDirectory(prefix='bdgs_ros-')
     )
 
+    def file(self, name: str) -> Path:
+        """Return a path that lives as long as the graph."""
+        return Path(self._folder.name) / name
+
     def start(self, name: str, values: Mapping[str, object]) -> None:
         """Start a node; call it from the main thread, which the children follow."""
         child = self.children.setdefault(name, Child(name, dict(values)))

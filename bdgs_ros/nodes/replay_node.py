@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import threading
 import time
 from collections import OrderedDict
+from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -23,6 +25,7 @@ from bdgs_ros.bridge.status import status_from_message
 from bdgs_ros.core.errors import BdgsError, ConfigError
 from bdgs_ros.data.bag import open_bag
 from bdgs_ros.data.bag_cursor import RawMessage
+from bdgs_ros.data.trajectory_io import write_text_atomically
 
 _POLL_S = 0.05
 _SETTLE_S = 0.5
@@ -201,7 +204,10 @@ class ReplayNode(GraphNode):
         self._health.counts['frames_missed_by_tracking'] = acks.missed
         if acks.missed:
             self._raw.wait_delivered(_QUIET_S)
-        self._health.publish_last()
+        self._health.publish()
+        if self._config.report_file:  # a short replay may end before its topics are discovered
+            text = json.dumps(self._health.values(), indent=1)
+            write_text_atomically(Path(self._config.report_file), text)
 
     def _on_pause(self, paused: bool) -> str:
         if paused:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import threading
 import time
@@ -49,6 +50,7 @@ class SlamNode(GraphNode):
         arguments = forwarded_arguments(sys.argv)
         self._children = Children(arguments)
         self._threads = InProcessNodes(arguments)
+        self._replay_report = self._children.file('replay.json')
         self._start_graph()
         self._timer = self.create_timer(
             _WATCH_PERIOD_S, self._watch, clock=Clock(clock_type=ClockType.STEADY_TIME)
@@ -64,7 +66,8 @@ class SlamNode(GraphNode):
                 self._threads.start(getattr(module, kind), values)
         if self._config.bag:
             wanted = max(len(_GRAPH), int(values.get('wait_subscribers', 0)))
-            self._children.start('replay_node', {**values, 'wait_subscribers': wanted})
+            own = {'wait_subscribers': wanted, 'report_file': str(self._replay_report)}
+            self._children.start('replay_node', {**values, **own})
 
     def _result_files(self) -> dict[str, str]:
         if not self._config.output:
@@ -141,6 +144,8 @@ class SlamNode(GraphNode):
         from bdgs_ros.data.bag_recording import BagRecording
 
         folder = Path(self._config.output).resolve()
+        report = json.loads(self._replay_report.read_text(encoding='utf-8'))
+        self._observer.diagnostics['replay'] = report
         with open_bag(self._config.bag) as reader:
             recording = BagRecording(reader)
             metrics = self._observer.write_metrics(
