@@ -197,7 +197,7 @@ class Mapper:
             camera,
             np.where(known[..., None], np.clip(color * 255 + 0.5, 0, 255), 0).astype(np.uint8),
             np.where(known, static.depth / safe, 0).astype(np.float32),
-            _to_probability_image(static.p_dynamic / safe),
+            _to_probability_image(np.asarray(static.p_dynamic / safe, np.float32)),
         )
 
     def save(self, path: Path) -> None:

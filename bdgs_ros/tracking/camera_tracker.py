@@ -96,11 +96,13 @@ class CameraTracker:
         current = self._pyramid(frame.color, frame.depth_m, prior, frame.camera)
         if self._keyframe is None:
             return self._start(frame, current, prior)
-        predicted, _ = self._motion.predict(frame.stamp_ns)
-        coarse = self._align(self._keyframe, current, predicted)
+        predicted, covariance = self._motion.predict(frame.stamp_ns)
+        information = np.asarray(np.linalg.inv(covariance), np.float64)
+        coarse = self._align(self._keyframe, current, predicted, information)
         p_dynamic = self._see_movers(prior, current, coarse)
-        fine = self._refine(frame, current, prior, p_dynamic, coarse)
-        return self._conclude(frame, fine, p_dynamic, predicted)
+        current = self._aligner.with_dynamic(current, p_dynamic)
+        fine = self._refine(current, coarse, information)
+        return self._conclude(frame, current, fine, p_dynamic, predicted)
 
     def _prior(self, frame: RgbdFrame, labels: Labels | None) -> ProbabilityImage:
         if labels is None or not self._config.masked:
@@ -135,11 +137,16 @@ class CameraTracker:
         )
 
     def _align(
-        self, reference: Reference, current: ImagePyramid, guess: Pose, fine_only: bool = False
+        self,
+        reference: Reference,
+        current: ImagePyramid,
+        guess: Pose,
+        information: NDArray[np.float64],
+        fine_only: bool = False,
     ) -> Estimate:
         T_current_reference = se3.inverse(guess) @ reference.T_world_camera
         quality = self._aligner.align(
-            reference.pyramid, current, T_current_reference, fine_only=fine_only
+            reference.pyramid, current, T_current_reference, fine_only, information
         )
         T_world_camera = reference.T_world_camera @ se3.inverse(quality.T_current_reference)
         return Estimate(se3.orthonormalise(T_world_camera), quality)
@@ -155,19 +162,14 @@ class CameraTracker:
         return np.maximum(prior, nearer_than_model(maps, prior.shape, self._config.movers))
 
     def _refine(
-        self,
-        frame: RgbdFrame,
-        current: ImagePyramid,
-        prior: ProbabilityImage,
-        p_dynamic: ProbabilityImage,
-        coarse: Estimate,
+        self, current: ImagePyramid, coarse: Estimate, information: NDArray[np.float64]
     ) -> Estimate:
         """Align to the rendered static map, starting from the coarse pose."""
         if self._model is None or not self._config.refine:
             return coarse
-        if p_dynamic is not prior:
-            current = self._pyramid(frame.color, frame.depth_m, p_dynamic, frame.camera)
-        fine = self._align(self._model, current, coarse.T_world_camera, fine_only=True)
+        fine = self._align(
+            self._model, current, coarse.T_world_camera, information, fine_only=True
+        )
         return fine if self._is_good(fine.quality) else coarse
 
     def _is_good(self, quality: AlignResult) -> bool:
@@ -179,6 +181,7 @@ class CameraTracker:
     def _conclude(
         self,
         frame: RgbdFrame,
+        current: ImagePyramid,
         estimate: Estimate,
         p_dynamic: ProbabilityImage,
         predicted: Pose,
@@ -190,7 +193,6 @@ class CameraTracker:
         self._motion.update(frame.stamp_ns, estimate.T_world_camera, quality.covariance)
         is_keyframe = self._needs_keyframe(estimate)
         if is_keyframe:
-            current = self._pyramid(frame.color, frame.depth_m, p_dynamic, frame.camera)
             self._become_keyframe(frame, estimate.T_world_camera, current)
         return TrackingResult(
             frame.stamp_ns,
