@@ -85,10 +85,10 @@ class Optimiser:
         active = visible & self._opaque_enough(gaussians.logit_opacities, level_index)
         result = self._photometric(gaussians, keyframe, level, active)
         gradients = dict(zip(PARAMETERS, result.gradients.parameters(), strict=True))
-        regulariser = self._add_direct_terms(gaussians, gradients, level)
-        touched = result.visibility > 0
-        touched |= gaussians.states == State.DYNAMIC
-        self._adam(gaussians, gradients, touched)
+        # Gaussians that Eq. 11 hides are frozen, opacity too, so that they can come back.
+        penalised = visible & (gaussians.states == State.DYNAMIC)
+        regulariser = self._add_direct_terms(gaussians, gradients, level, penalised)
+        self._adam(gaussians, gradients, (result.visibility > 0) | penalised)
         self._adapt_exposure(keyframe, result.exposure_gradient)
         keyframe.visits += 1
         return result.loss + regulariser
@@ -123,13 +123,17 @@ class Optimiser:
         )
 
     def _add_direct_terms(
-        self, gaussians: GaussianMap, gradients: dict[str, Array], level: Level
+        self,
+        gaussians: GaussianMap,
+        gradients: dict[str, Array],
+        level: Level,
+        penalised: NDArray[np.bool_],
     ) -> float:
         """Add the last two terms of Eq. 7; per pixel like the first, so that they compare."""
         per_pixel = np.float32(1 / level.weight.size)
         weights = self._config.loss
         dynamic, gradient = losses.dynamic_penalty(
-            gaussians.logit_opacities, gaussians.states == State.DYNAMIC, gaussians.p_dynamic
+            gaussians.logit_opacities, penalised, gaussians.p_dynamic
         )
         gradients['logit_opacities'] += np.float32(weights.dynamic) * per_pixel * gradient
         large, gradient = losses.covariance_penalty(gaussians.log_scales)
