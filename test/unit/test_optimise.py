@@ -1,0 +1,104 @@
+"""Eq. 7, 12 and 13 in the optimiser."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from bdgs_ros.core.camera import PinholeCamera
+from bdgs_ros.core.config import BeliefConfig, MappingConfig
+from bdgs_ros.mapping.gaussians import GaussianMap, NewGaussians
+from bdgs_ros.mapping.keyframes import MapKeyframe, build_levels
+from bdgs_ros.mapping.optimise import Optimiser
+from bdgs_ros.mapping.rasterize import render
+
+CAMERA = PinholeCamera(64, 48, 60.0, 60.0, 31.5, 23.5)
+CONFIG = replace(MappingConfig(), iterations=40, threads=1)
+
+
+def scene(seed: int = 0) -> tuple[GaussianMap, MapKeyframe]:
+    """Gaussians on a plane, and a keyframe of them with other colours."""
+    rng = np.random.default_rng(seed)
+    depth = np.full(CAMERA.shape, 2.0, np.float32)
+    pixels = np.zeros(CAMERA.shape, bool)
+    pixels[::2, ::2] = True
+    means = CAMERA.unproject(depth)[pixels]
+    count = len(means)
+    colors = rng.random((count, 3)).astype(np.float32)
+    gaussians = GaussianMap(BeliefConfig())
+    scales = np.full(count, 0.03, np.float32)
+    gaussians.append(NewGaussians(means, scales, colors, np.full(count, 0.3, np.float32)), 0.8, 0)
+    image = render(gaussians.as_gaussians(), np.eye(4), CAMERA).color
+    gaussians.parameters['colors'][:] = 0.5
+    color = (255 * np.clip(image, 0, 1)).astype(np.uint8)
+    levels = build_levels(color, depth, np.zeros(CAMERA.shape, bool), CAMERA, 3)
+    keyframe = MapKeyframe(1, 0, np.eye(4), np.zeros(CAMERA.shape, np.uint8), levels)
+    return gaussians, keyframe
+
+
+def test_the_loss_falls() -> None:
+    gaussians, keyframe = scene()
+    losses = Optimiser(CONFIG).run(gaussians, keyframe, [])
+    assert len(losses) == CONFIG.iterations
+    assert losses[-1] < 0.8 * losses[-20]
+
+
+def test_levels_go_from_coarse_to_fine() -> None:
+    levels = list(Optimiser(CONFIG)._levels(3))
+    assert levels == sorted(levels, reverse=True)
+    assert len(levels) == CONFIG.iterations
+    assert set(levels) == {0, 1, 2}
+    assert levels.count(0) == CONFIG.iterations - round(CONFIG.iterations * 0.4)
+
+
+def test_one_level_takes_all_iterations() -> None:
+    assert list(Optimiser(CONFIG)._levels(1)) == [0] * CONFIG.iterations
+
+
+def test_opacity_threshold_doubles_with_each_coarser_level() -> None:
+    optimiser = Optimiser(CONFIG)
+    tau = CONFIG.pyramid.opacity_threshold
+    alpha = np.array([0.9 * tau, 1.1 * tau, 2.2 * tau, 4.4 * tau])
+    logit = np.log(alpha / (1 - alpha)).astype(np.float32)
+    counts = [int(optimiser._opaque_enough(logit, level).sum()) for level in range(3)]
+    assert counts == [3, 2, 1]
+
+
+def test_half_of_the_iterations_look_at_the_newest_keyframe() -> None:
+    _, newest = scene()
+    _, other = scene(1)
+    views = [kf for kf, _ in Optimiser(CONFIG)._schedule(newest, [other])]
+    assert sum(kf is newest for kf in views) == CONFIG.iterations // 2
+
+
+def test_hidden_gaussians_are_frozen() -> None:
+    gaussians, keyframe = scene()
+    gaussians.belief.smoothed[:100] = 0.9
+    gaussians.belief.belief[:100] = 0.9
+    before = {name: array[:100].copy() for name, array in gaussians.parameters.items()}
+    Optimiser(CONFIG).run(gaussians, keyframe, [])
+    for name, array in before.items():
+        np.testing.assert_array_equal(gaussians.parameters[name][:100], array, err_msg=name)
+
+
+def test_the_penalty_makes_dynamic_gaussians_fainter() -> None:
+    """Second term of Eq. 7, on Gaussians between the decision and the mask."""
+    faint = []
+    for weight in (0.0, 0.15):
+        gaussians, keyframe = scene()
+        gaussians.belief.belief[:100] = gaussians.belief.smoothed[:100] = 0.65
+        loss = replace(CONFIG.loss, dynamic=weight)
+        Optimiser(replace(CONFIG, loss=loss)).run(gaussians, keyframe, [])
+        faint.append(float(gaussians.logit_opacities[:100].mean()))
+    assert faint[1] < faint[0]
+
+
+def test_exposure_is_fitted_except_for_the_first_keyframe() -> None:
+    for index, moves in ((0, False), (1, True)):
+        gaussians, keyframe = scene()
+        keyframe.index = index
+        brighter = tuple(
+            replace(level, color=np.clip(1.3 * level.color, 0, 1)) for level in keyframe.levels
+        )
+        keyframe.levels = brighter
+        Optimiser(CONFIG).run(gaussians, keyframe, [])
+        assert (abs(keyframe.exposure[0]) > 0.005) == moves
