@@ -1,8 +1,9 @@
 """
-Give Fast DDS a shared-memory segment that images fit into.
+Give Fast DDS a shared-memory segment that images fit into, and quicker discovery.
 
 The default segment of 512 KiB loses every second 640x480 image between two processes; with 64 MiB
-none is lost and the 95th percentile of the latency falls from 17-63 ms to 7-10 ms.
+none is lost and the 95th percentile of the latency falls from 17-63 ms to 7-10 ms. By default a
+participant that missed the first announcements waits 3 s for the next ones.
 """
 
 from __future__ import annotations
@@ -32,6 +33,15 @@ _PROFILE = """<?xml version="1.0" encoding="UTF-8"?>
   </transport_descriptors>
   <participant profile_name="bdgs_participant" is_default_profile="true">
     <rtps>
+      <builtin>
+        <discovery_config>
+          <leaseAnnouncement><sec>0</sec><nanosec>500000000</nanosec></leaseAnnouncement>
+          <initialAnnouncements>
+            <count>20</count>
+            <period><sec>0</sec><nanosec>100000000</nanosec></period>
+          </initialAnnouncements>
+        </discovery_config>
+      </builtin>
       <useBuiltinTransports>false</useBuiltinTransports>
       <userTransports>
         <transport_id>bdgs_shm</transport_id>

@@ -5,10 +5,13 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Mapping, Sequence
 
-from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
+from rclpy.executors import MultiThreadedExecutor
 from rclpy.parameter import Parameter
 
 from bdgs_ros.bridge.runner import GraphNode
+
+_SPIN_S = 0.1
+_GRACE_S = 2.0
 
 
 class InProcessNodes:
@@ -25,6 +28,7 @@ class InProcessNodes:
     def __init__(self, ros_arguments: Sequence[str]) -> None:
         self._arguments = ['--ros-args', *ros_arguments]
         self._nodes: list[GraphNode] = []
+        self._threads: list[threading.Thread] = []
         self._stopping = False
 
     def start(self, kind: Callable[..., GraphNode], values: Mapping[str, object]) -> None:
@@ -35,19 +39,21 @@ class InProcessNodes:
             use_global_arguments=False,  # they name this process's main node
         )
         self._nodes.append(node)
-        threading.Thread(target=self._spin, args=(node,), daemon=True).start()
+        thread = threading.Thread(target=self._spin, args=(node,), daemon=True)
+        self._threads.append(thread)
+        thread.start()
 
     def _spin(self, node: GraphNode) -> None:
         executor = MultiThreadedExecutor(2)
         executor.add_node(node)
-        try:
-            while not self._stopping:
-                executor.spin_once(timeout_sec=0.5)
-        except ExternalShutdownException:
-            return
+        while not self._stopping:
+            executor.spin_once(timeout_sec=_SPIN_S)
+        executor.shutdown(_GRACE_S)
 
     def stop(self) -> None:
-        """End the nodes."""
+        """End the nodes; their threads must be gone before rclpy is."""
         self._stopping = True
         for node in self._nodes:
             node.close()
+        for thread in self._threads:
+            thread.join(_GRACE_S)
