@@ -173,9 +173,11 @@ class CameraTracker:
         return fine if self._is_good(fine.quality) else coarse
 
     def _is_good(self, quality: AlignResult) -> bool:
+        # A covered lens agrees with everything at gain 0.
         return (
             quality.inlier_ratio >= self._config.lost_inlier_ratio
             and quality.coverage >= self._config.lost_coverage
+            and 1 / self._config.lost_gain < quality.gain < self._config.lost_gain
         )
 
     def _conclude(
@@ -214,10 +216,11 @@ class CameraTracker:
     ) -> TrackingResult:
         """Report loss; the next frames try again from where the camera was last seen."""
         _log.warning(
-            'lost at stamp %d ns: %.0f %% inliers on %.0f %% of the image',
+            'lost at stamp %d ns: %.0f %% inliers on %.0f %% of the image, exposure gain %.2f',
             frame.stamp_ns,
             100 * quality.inlier_ratio,
             100 * quality.coverage,
+            quality.gain,
         )
         return TrackingResult(
             frame.stamp_ns,

@@ -103,6 +103,9 @@ class TrackingConfig:
     lost_coverage: float = param(
         0.04, 'smaller share of static pixels compared: lost', low=0.0, high=1.0
     )
+    lost_gain: float = param(
+        3.0, 'exposure changed by more than this factor, or contrast is gone: lost', low=1.1
+    )
     motion: MotionConfig = field(default_factory=MotionConfig)
     align: AlignConfig = field(default_factory=AlignConfig)
     keyframe: KeyframeConfig = field(default_factory=KeyframeConfig)

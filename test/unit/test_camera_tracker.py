@@ -1,0 +1,138 @@
+"""The tracker in a rendered room with exact truth: poses, keyframes, loss and recovery."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bdgs_ros.core import se3
+from bdgs_ros.core.camera import PinholeCamera
+from bdgs_ros.core.config import BdgsConfig
+from bdgs_ros.core.types import Labels, ModelView, RgbdFrame, TrackingResult, TrackingStatus
+from bdgs_ros.data.synth.render import FrameRenderer
+from bdgs_ros.data.synth.scenarios import make_world
+from bdgs_ros.tracking.camera_tracker import CameraTracker
+
+CAMERA = PinholeCamera(320, 240, 267.7, 269.6, 159.8, 123.6)
+CONFIG = BdgsConfig().tracking
+PERIOD_S = 1 / 30
+FRAMES = 16
+
+
+@pytest.fixture(scope='module')
+def recording() -> tuple[list[RgbdFrame], list[np.ndarray]]:
+    """A camera that moves through a static room, from the middle of the scenario."""
+    world = make_world('static', 3, 4.0)
+    renderer = FrameRenderer(world, CAMERA, 0.01)
+    frames, poses = [], []
+    for i in range(FRAMES):
+        time_s = 1.5 + i * PERIOD_S
+        images = renderer.render(time_s)
+        color = np.ascontiguousarray(images.color).astype(np.uint8)
+        depth = images.static_depth_m.astype(np.float32)
+        frames.append(RgbdFrame(round(time_s * 1e9), color, depth, CAMERA))
+        poses.append(world.camera_path.pose(time_s))
+    return frames, poses
+
+
+def error_m(result: TrackingResult, poses: list[np.ndarray], i: int) -> float:
+    truth = se3.inverse(poses[0]) @ poses[i]
+    return float(np.linalg.norm(se3.log(se3.inverse(truth) @ result.T_world_camera)[:3]))
+
+
+def test_poses_are_right_to_millimetres(recording: tuple) -> None:
+    frames, poses = recording
+    tracker = CameraTracker(CONFIG)
+    results = [tracker.process(frame) for frame in frames]
+    assert all(r.status is TrackingStatus.OK for r in results)
+    assert results[0].is_keyframe
+    travelled = np.linalg.norm(poses[-1][:3, 3] - poses[0][:3, 3])
+    assert travelled > 0.02
+    assert max(error_m(r, poses, i) for i, r in enumerate(results)) < 0.005
+
+
+def test_the_model_corrects_a_keyframe_that_is_off(recording: tuple) -> None:
+    """The view of the map outweighs the drift of the last keyframe."""
+    frames, _ = recording
+    tracker = CameraTracker(CONFIG)
+    first = tracker.process(frames[0])
+    shift = se3.exp(np.array([0.01, 0, 0, 0, 0, 0]))
+    view = ModelView(
+        frames[0].stamp_ns,
+        first.T_world_camera @ shift,
+        CAMERA,
+        frames[0].color,
+        frames[0].depth_m,
+        np.zeros(CAMERA.shape, np.uint8),
+    )
+    tracker.set_model(view)
+    again = tracker.process(replace(frames[0], stamp_ns=frames[1].stamp_ns))
+    offset = se3.log(se3.inverse(view.T_world_camera) @ again.T_world_camera)
+    assert np.linalg.norm(offset[:3]) < 0.004
+
+
+def test_a_covered_lens_is_lost_and_found_again(recording: tuple) -> None:
+    frames, poses = recording
+    tracker = CameraTracker(CONFIG)
+    for frame in frames[:5]:
+        tracker.process(frame)
+    dark = np.zeros_like(frames[0].color)
+    no_depth = np.zeros_like(frames[0].depth_m)
+    lost = [tracker.process(replace(f, color=dark, depth_m=no_depth)) for f in frames[5:8]]
+    assert all(r.status is TrackingStatus.LOST and not r.is_keyframe for r in lost)
+    found = tracker.process(frames[8])
+    assert found.status is TrackingStatus.OK
+    assert error_m(found, poses, 8) < 0.01
+
+
+def test_a_frame_that_is_all_people_is_lost(recording: tuple) -> None:
+    frames, _ = recording
+    tracker = CameraTracker(CONFIG)
+    tracker.process(frames[0])
+    everywhere = Labels(frames[1].stamp_ns, np.full(CAMERA.shape, 255, np.uint8))
+    assert tracker.process(frames[1], everywhere).status is TrackingStatus.LOST
+
+
+def test_keyframes_come_at_least_every_interval(recording: tuple) -> None:
+    frames, _ = recording
+    config = replace(CONFIG, keyframe=replace(CONFIG.keyframe, max_interval=4))
+    tracker = CameraTracker(config)
+    flags = [tracker.process(frame).is_keyframe for frame in frames]
+    gaps = np.diff(np.flatnonzero(flags))
+    assert flags[0]
+    assert gaps.max() <= 4
+
+
+def test_a_mover_in_front_of_the_model_is_marked_without_a_detector(recording: tuple) -> None:
+    frames, _ = recording
+    tracker = CameraTracker(CONFIG)
+    first = tracker.process(frames[0])
+    nothing = np.zeros(CAMERA.shape, np.uint8)
+    view = ModelView(
+        frames[0].stamp_ns,
+        first.T_world_camera,
+        CAMERA,
+        frames[0].color,
+        frames[0].depth_m,
+        nothing,
+    )
+    tracker.set_model(view)
+    where = np.zeros(CAMERA.shape, bool)
+    where[60:180, 120:200] = True
+    color = np.where(where[..., None], np.uint8(40), frames[1].color)
+    depth = np.where(where, np.float32(0.8), frames[1].depth_m)
+    result = tracker.process(replace(frames[1], color=color, depth_m=depth))
+    marked = result.p_dynamic >= 128
+    assert (marked & where).sum() > 0.8 * where.sum()
+    assert (marked & ~where).sum() < 0.1 * where.sum()
+
+
+def test_reset_starts_a_new_world(recording: tuple) -> None:
+    frames, _ = recording
+    tracker = CameraTracker(CONFIG)
+    for frame in frames[:4]:
+        tracker.process(frame)
+    tracker.reset()
+    again = tracker.process(frames[2])
+    np.testing.assert_array_equal(again.T_world_camera, np.eye(4))
+    assert again.is_keyframe
