@@ -428,7 +428,8 @@ struct Totals {
 };
 
 struct alignas(64) Block {
-  float JI[kColor][kBlock], JD[kDepth][kBlock], rI[kBlock], rD[kBlock];
+  // columns of the Jacobians, and the residual as one more
+  float JI[kColor + 1][kBlock], JD[kDepth + 1][kBlock];
   float weight[kBlock], cost[kBlock];
   float abs_I[kBlock], abs_D[kBlock];  // |residual| of comparable pixels, -1 elsewhere
   float in_view[kBlock], reference[kBlock], compared[kBlock], inlier[kBlock];
@@ -455,6 +456,7 @@ BDGS_INLINE void fill_block_body(const Points* points, int begin, int n, const L
   const float* __restrict smooth = images->smooth.data();
   const float* __restrict dx = images->dx.data();
   const float* __restrict dy = images->dy.data();
+  const float* __restrict raw = images->inverse_depth.data();
   const float* __restrict cstatic = level->p_static.data();
   Block& out = *block;
   const State s = *state;
@@ -502,10 +504,7 @@ BDGS_INLINE void fill_block_body(const Points* points, int begin, int n, const L
     const float eD = has_depth * (mix(ra, rb, rc, rd, fu, fv) - iz + warp);
 
     // gradients: grey as the mean of both images (efficient second order), inverse depth smooth
-    const float gu =
-        0.5f * (mix(gx[at], gx[at + 1], gx[at + width], gx[at + width + 1], fu, fv) + pgx[i]);
-    const float gv =
-        0.5f * (mix(gy[at], gy[at + 1], gy[at + width], gy[at + width + 1], fu, fv) + pgy[i]);
+    const float gu = 0.5f * (gx[near] + pgx[i]), gv = 0.5f * (gy[near] + pgy[i]);
     const float du = dx[near], dv = dy[near];
 
     // weights: t-distribution of both residuals together, times P(static)
@@ -513,7 +512,9 @@ BDGS_INLINE void fill_block_body(const Points* points, int begin, int n, const L
     const float iD = 1.0f / __builtin_sqrtf(var_D + var_px * (du * du + dv * dv));
     const float nI = eI * iI, nD = eD * iD;
     const float m2 = nI * nI + nD * nD;
-    const float w = (dof + 1.0f + has_depth) / (dof + m2);
+    const float gap = raw[near] - iz, limit = 0.03f * iz + 4.0f * s.scales.inverse_depth;
+    const float same = (raw[near] > 0 && abs_f(gap) > limit) ? 0.0f : 1.0f;  // surface
+    const float w = same * (dof + 1.0f + has_depth) / (dof + m2);
     const float ps = seen * pstatic[i] * cstatic[near];
     const float root = __builtin_sqrtf(ps * w);
     const float hI = root * iI, hD = root * iD * has_depth * sqrt_depth_weight;
@@ -527,7 +528,7 @@ BDGS_INLINE void fill_block_body(const Points* points, int begin, int n, const L
     out.JI[5][i] = hI * (x * ay - y * ax);
     out.JI[6][i] = -hI * pgrey[i];
     out.JI[7][i] = -hI;
-    out.rI[i] = hI * eI;
+    out.JI[kColor][i] = hI * eI;
     const float bx = du * fx * iz, by = dv * fy * iz, bz = -(bx * tx + by * ty) + iz * iz;
     out.JD[0][i] = hD * bx;
     out.JD[1][i] = hD * by;
@@ -538,7 +539,7 @@ BDGS_INLINE void fill_block_body(const Points* points, int begin, int n, const L
     out.JD[6][i] = hD * qxx;
     out.JD[7][i] = hD * qyy;
     out.JD[8][i] = hD * qxy;
-    out.rD[i] = hD * eD;
+    out.JD[kDepth][i] = hD * eD;
 
     const float aI = abs_f(eI), aD = abs_f(eD);
     const float compared = ps >= min_static ? 1.0f : 0.0f;
@@ -548,7 +549,7 @@ BDGS_INLINE void fill_block_body(const Points* points, int begin, int n, const L
     out.abs_I[i] = compared > 0 ? aI : -1.0f;
     out.abs_D[i] = compared * has_depth > 0 ? aD : -1.0f;
     out.compared[i] = compared;
-    out.inlier[i] = (aI < inlier_I && aD < inlier_D) ? compared : 0.0f;
+    out.inlier[i] = (aI < inlier_I && aD < inlier_D) ? compared * same : 0.0f;
     out.reference[i] = reference;
     out.in_view[i] = reference * seen;
   }
@@ -558,11 +559,30 @@ BDGS_VERSIONS(fill_block,
                const Params* params, Block* block),
               (points, begin, n, level, state, params, block))
 
-BDGS_INLINE float dot(const float* __restrict a, const float* __restrict b, int n) {
-  float sum = 0;
-#pragma omp simd reduction(+ : sum)
-  for (int i = 0; i < n; ++i) sum += a[i] * b[i];
-  return sum;
+// Products of one column with four others: four sums at once keep the processor busy.
+BDGS_INLINE void dots(const float* __restrict a, const float (*b)[kBlock], int n, double* out) {
+  float s0 = 0, s1 = 0, s2 = 0, s3 = 0;
+#pragma omp simd reduction(+ : s0, s1, s2, s3)
+  for (int i = 0; i < n; ++i) {
+    s0 += a[i] * b[0][i];
+    s1 += a[i] * b[1][i];
+    s2 += a[i] * b[2][i];
+    s3 += a[i] * b[3][i];
+  }
+  out[0] = s0;
+  out[1] = s1;
+  out[2] = s2;
+  out[3] = s3;
+}
+
+// All products of N columns, i <= j; a few below the diagonal come along.
+template <int N>
+BDGS_INLINE void gram(const float (*J)[kBlock], int n, double (*out)[N]) {
+  for (int i = 0; i < N; ++i) {
+    int j = i;
+    for (; j + 4 <= N; j += 4) dots(J[i], J + j, n, &out[i][j]);
+    if (j < N) dots(J[i], J + (N - 4), n, &out[i][N - 4]);
+  }
 }
 
 BDGS_INLINE float total(const float* __restrict a, int n) {
@@ -573,15 +593,17 @@ BDGS_INLINE float total(const float* __restrict a, int n) {
 }
 
 BDGS_INLINE void add_block_body(const Block* block, int n, Totals* totals) {
+  double color[kColor + 1][kColor + 1], depth[kDepth + 1][kDepth + 1];
+  gram<kColor + 1>(block->JI, n, color);
+  gram<kDepth + 1>(block->JD, n, depth);
   for (int i = 0; i < kColor; ++i) {
-    for (int j = i; j < kColor; ++j) totals->H[i][j] += dot(block->JI[i], block->JI[j], n);
-    totals->g[i] += dot(block->JI[i], block->rI, n);
+    for (int j = i; j < kColor; ++j) totals->H[i][j] += color[i][j];
+    totals->g[i] += color[i][kColor];
   }
   for (int i = 0; i < kDepth; ++i) {
     const int row = i < 6 ? i : i + 2;  // gain and bias lie between
-    for (int j = i; j < kDepth; ++j)
-      totals->H[row][j < 6 ? j : j + 2] += dot(block->JD[i], block->JD[j], n);
-    totals->g[row] += dot(block->JD[i], block->rD, n);
+    for (int j = i; j < kDepth; ++j) totals->H[row][j < 6 ? j : j + 2] += depth[i][j];
+    totals->g[row] += depth[i][kDepth];
   }
   totals->cost += total(block->cost, n);
   totals->weight += total(block->weight, n);

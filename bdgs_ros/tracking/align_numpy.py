@@ -14,9 +14,10 @@ estimated along, with a prior, as are gain and bias (auto exposure). Depth is no
 discontinuities.
 
 The two residuals share one weight, that of a t-distribution: a pixel whose depth is wrong (an
-occlusion) has no say about colour either. Their scales are medians of the residuals with a floor,
-and grow with the gradient, because images are warped to a fraction of a pixel only. The gradient
-of grey is the mean of both images (efficient second-order minimisation, Malis 2004).
+occlusion) has no say about colour either, and none at all where another surface is seen. Their
+scales are medians of the residuals with a floor, and grow with the gradient, because images are
+warped to a fraction of a pixel only. The gradient of grey is the mean of both images (efficient
+second-order minimisation, Malis 2004).
 
 The motion is updated from the left, `T <- exp(xi) T`, `xi = (rho, phi)`.
 
@@ -53,6 +54,7 @@ _BLOCK, _SAMPLE_BLOCKS = 256, 16  # medians are taken of 16 runs of 256 points
 _SIGMA_PER_MEDIAN = 1.4826
 _OVER_RELAXATION = 1.3  # reweighting and gradient noise make steps too short
 _BRIGHTNESS_TIE = 1e-3  # share of the pixels that say gain 1 and bias 0
+_SURFACE_SHARE, _SURFACE_SCALES = 0.03, 4.0  # inverse depth may differ by share and scales
 _RESERVED = 4  # iterations kept for every finer level
 _COARSE_STOP = 2.0  # coarser levels stop at larger steps
 
@@ -187,6 +189,9 @@ class Linearised:
     p_static: Array
     grey_gradient: Array
     depth_gradient: Array
+    gap: Array
+    """How much nearer the current image is, 1/m; 0 where it has no depth."""
+    inverse_z: Array
 
 
 def linearise(points: Points, level: Level, T: Array, appearance: Appearance) -> Linearised:
@@ -200,7 +205,7 @@ def linearise(points: Points, level: Level, T: Array, appearance: Appearance) ->
     change = _pattern(points, w)
     e_D = has_depth * (measured - inverse_z + change @ appearance.values[2:])
 
-    current = np.stack([_bilinear(level.gx, w)[0], _bilinear(level.gy, w)[0]], axis=1)
+    current = np.stack([_nearest(level.gx, w), _nearest(level.gy, w)], axis=1)
     gradient_I = 0.5 * (current + points.gradient)
     gradient_D = np.stack([_nearest(level.dx, w), _nearest(level.dy, w)], axis=1)
     J_I = np.zeros((len(e_I), 11))
@@ -214,7 +219,20 @@ def linearise(points: Points, level: Level, T: Array, appearance: Appearance) ->
     J_D[:, 3:6] += np.cross(w.xyz, along_z)
     J_D[:, 8:] = change
     p_static = w.seen * points.p_static * _nearest(level.p_static, w)
-    return Linearised(e_I, e_D, J_I, J_D, has_depth, w.seen, p_static, gradient_I, gradient_D)
+    raw = _nearest(level.inverse_depth, w)
+    return Linearised(
+        e_I,
+        e_D,
+        J_I,
+        J_D,
+        has_depth,
+        w.seen,
+        p_static,
+        gradient_I,
+        gradient_D,
+        np.where(raw > 0, raw - inverse_z, 0.0),
+        inverse_z,
+    )
 
 
 @dataclass(frozen=True)
@@ -250,6 +268,12 @@ def _scales(rows: Linearised, params: Params) -> Scales:
     )
 
 
+def _same_surface(rows: Linearised, scales: Scales) -> NDArray[np.bool_]:
+    """Tell where the image does not show something else: an occluder, or what it uncovered."""
+    limit = _SURFACE_SHARE * rows.inverse_z + _SURFACE_SCALES * scales.inverse_depth
+    return np.abs(rows.gap) <= limit
+
+
 def _totals(
     points: Points, level: Level, rows: Linearised, scales: Scales, params: Params
 ) -> dict[str, Any]:
@@ -258,7 +282,8 @@ def _totals(
     var_I = scales.intensity**2 + noise * (rows.grey_gradient**2).sum(axis=1)
     var_D = scales.inverse_depth**2 + noise * (rows.depth_gradient**2).sum(axis=1)
     squared = rows.grey**2 / var_I + rows.depth**2 / var_D
-    weight = rows.p_static * (params.dof + 1 + rows.has_depth) / (params.dof + squared)
+    same = _same_surface(rows, scales)
+    weight = rows.p_static * same * (params.dof + 1 + rows.has_depth) / (params.dof + squared)
     w_I, w_D = weight / var_I, weight * rows.has_depth * params.depth_weight / var_D
     information: Array = rows.J_I.T @ (w_I[:, None] * rows.J_I)
     information += rows.J_D.T @ (w_D[:, None] * rows.J_D)
@@ -275,7 +300,7 @@ def _totals(
         'cost': float((weight * squared).sum()),
         'weight': float((weight * (1 + rows.has_depth)).sum()),
         'compared': int(compared.sum()),
-        'inliers': int((compared & agree).sum()),
+        'inliers': int((compared & agree & same).sum()),
         'reference': int(reference.sum()),
         'in_view': int((reference & rows.seen).sum()),
         'median_intensity': median_I,
