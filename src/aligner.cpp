@@ -72,8 +72,8 @@ struct Params {
   double intensity_noise = 0.01;
   double pixel_noise = 0.2;
   double depth_noise = 0.0025;
-  double depth_weight = 0.3;
-  double pattern_information = 4e4;
+  double depth_weight = 0.5;
+  double pattern_information = 1.25e5;
   double inlier_intensity = 0.08;
   double inlier_depth_sigma = 6.0;
   double min_static = 0.25;

@@ -70,7 +70,7 @@ class Params:
     pixel_noise: float = 0.2
     depth_noise: float = 0.0025
     depth_weight: float = 0.5
-    pattern_information: float = 1e5
+    pattern_information: float = 1.25e5
     inlier_intensity: float = 0.08
     inlier_depth_sigma: float = 6.0
     min_static: float = 0.25

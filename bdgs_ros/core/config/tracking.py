@@ -49,10 +49,10 @@ class AlignConfig:
         0.5, 'of depth against colour, beyond their noise', low=0.0, high=100.0
     )
     pattern_sigma: float = param(
-        0.03, 'bend of the depth image that is the sensor', unit='1/m', low=1e-6, high=10.0
+        0.2, 'bend of the depth image that is the sensor', unit='1/m', low=1e-6, high=10.0
     )
     correlated_pixels: float = param(
-        100.0, 'pixels that err together; scales the covariance', low=1.0, high=1e6
+        5000.0, 'pixels that err together; scales the covariance', low=1.0, high=1e6
     )
     inlier_intensity: float = param(
         0.08, 'colour agrees within this', unit='grey level in [0, 1]', low=1e-3, high=1.0
