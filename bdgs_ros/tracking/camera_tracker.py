@@ -8,7 +8,7 @@ decide whether the pose can be trusted and whether the frame becomes a keyframe.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +56,13 @@ class CameraTracker:
     def __init__(self, config: TrackingConfig) -> None:
         self._config = config
         self._aligner = Aligner(config.align)
+        self._refiner = Aligner(
+            replace(
+                config.align,
+                intensity_noise=config.refine.intensity_noise,
+                depth_weight=config.refine.depth_weight,
+            )
+        )
         self._motion = MotionPredictor(config.motion)
         self.reset()
 
@@ -144,8 +151,9 @@ class CameraTracker:
         information: NDArray[np.float64],
         fine_only: bool = False,
     ) -> Estimate:
+        aligner = self._refiner if fine_only else self._aligner
         T_current_reference = se3.inverse(guess) @ reference.T_world_camera
-        quality = self._aligner.align(
+        quality = aligner.align(
             reference.pyramid, current, T_current_reference, fine_only, information
         )
         T_world_camera = reference.T_world_camera @ se3.inverse(quality.T_current_reference)
@@ -165,7 +173,7 @@ class CameraTracker:
         self, current: ImagePyramid, coarse: Estimate, information: NDArray[np.float64]
     ) -> Estimate:
         """Align to the rendered static map, starting from the coarse pose."""
-        if self._model is None or not self._config.refine:
+        if self._model is None or not self._config.refine.enabled:
             return coarse
         fine = self._align(
             self._model, current, coarse.T_world_camera, information, fine_only=True

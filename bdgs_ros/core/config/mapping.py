@@ -15,14 +15,14 @@ class LossConfig:
     dynamic: float = param(0.15, 'lambda_dyn of Eq. 7', low=0.0)
     reg: float = param(1.0, 'lambda_reg of Eq. 7 on the squared norm of Sigma', low=0.0)
     ssim: float = param(0.2, 'gamma of Eq. 9', low=0.0, high=1.0)
-    depth: float = param(0.2, 'weight of the depth term', unit='1/m', low=0.0)
+    depth: float = param(1.0, 'weight of the depth term', unit='1/m', low=0.0)
 
 
 @dataclass(frozen=True)
 class LearningRateConfig:
     """Adam step sizes."""
 
-    means: float = param(0.0005, 'positions', unit='m', low=0.0)
+    means: float = param(0.002, 'positions', unit='m', low=0.0)
     scales: float = param(0.005, 'log scales', low=0.0)
     quats: float = param(0.002, 'rotations', low=0.0)
     opacities: float = param(0.05, 'logit opacities', low=0.0)

@@ -79,6 +79,19 @@ class KeyframeConfig:
 
 
 @dataclass(frozen=True)
+class RefineConfig:
+    """Alignment to the rendered static map, which is smoother than a camera's image."""
+
+    enabled: bool = param(True, 'refine against the rendered static map')
+    intensity_noise: float = param(
+        0.03, 'least scale of colour residuals', unit='grey level in [0, 1]', low=1e-4, high=1.0
+    )
+    depth_weight: float = param(
+        1.0, 'of depth against colour, beyond their noise', low=0.0, high=100.0
+    )
+
+
+@dataclass(frozen=True)
 class MoversConfig:
     """What counts as standing before the static map, whatever the detector says."""
 
@@ -96,7 +109,6 @@ class TrackingConfig:
     """The camera pose of every frame."""
 
     masked: bool = param(True, 'weigh residuals by P(static)')
-    refine: bool = param(True, 'refine against the rendered static map')
     lost_inlier_ratio: float = param(
         0.3, 'fewer inliers among the compared pixels: lost', low=0.0, high=1.0
     )
@@ -108,5 +120,6 @@ class TrackingConfig:
     )
     motion: MotionConfig = field(default_factory=MotionConfig)
     align: AlignConfig = field(default_factory=AlignConfig)
+    refine: RefineConfig = field(default_factory=RefineConfig)
     keyframe: KeyframeConfig = field(default_factory=KeyframeConfig)
     movers: MoversConfig = field(default_factory=MoversConfig)
