@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import cv2
@@ -33,7 +34,7 @@ class Level:
     weight: Array  # [H, W] 1 where static, 0 where something moves
 
 
-@dataclass
+@dataclass(eq=False)
 class MapKeyframe:
     """One keyframe in the map's window."""
 
@@ -143,6 +144,19 @@ def _halve(level: Level) -> Level:
         _sample_depth(level.depth_m, camera.shape),
         np.asarray(weight >= 1, np.float32),
     )
+
+
+def most_redundant(keyframes: Sequence[MapKeyframe]) -> MapKeyframe:
+    """Return the keyframe that another one, from about the same place, can best stand in for."""
+    if len(keyframes) == 1:
+        return keyframes[0]
+    positions = np.array([k.T_world_camera[:3, 3] for k in keyframes])
+    forward = np.array([k.T_world_camera[:3, 2] for k in keyframes])
+    # A metre apart and a radian turned count alike: either changes what is seen about as much.
+    apart = np.linalg.norm(positions[:, None] - positions[None], axis=2)
+    turned = np.arccos(np.clip(forward @ forward.T, -1, 1))
+    distance = apart + turned + np.diag(np.full(len(keyframes), np.inf))
+    return keyframes[int(distance.min(axis=1).argmin())]
 
 
 def is_dynamic(p_dynamic: ProbabilityImage) -> NDArray[np.bool_]:

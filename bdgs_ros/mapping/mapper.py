@@ -15,7 +15,13 @@ from bdgs_ros.core.images import without_specks
 from bdgs_ros.core.types import Keyframe, ModelView, Pose, ProbabilityImage
 from bdgs_ros.mapping import growth
 from bdgs_ros.mapping.gaussians import GaussianMap
-from bdgs_ros.mapping.keyframes import MapKeyframe, build_levels, is_dynamic, shrink
+from bdgs_ros.mapping.keyframes import (
+    MapKeyframe,
+    build_levels,
+    is_dynamic,
+    most_redundant,
+    shrink,
+)
 from bdgs_ros.mapping.optimise import Optimiser
 from bdgs_ros.mapping.ply import load_ply, save_ply
 from bdgs_ros.mapping.rasterize import Rendered, render
@@ -125,6 +131,9 @@ class Mapper:
         if self.keyframes:
             current.exposure = self.keyframes[-1].exposure.copy()
         self.keyframes.append(current)
+        if len(self.keyframes) > max(self._config.keyframes, self._config.window):
+            older = self.keyframes[: -self._config.window]
+            self.keyframes.remove(most_redundant(older))
         self._count += 1
         return current
 

@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
+from bdgs_ros.core import se3
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.config import BeliefConfig, MappingConfig
 from bdgs_ros.core.types import Keyframe, RgbdFrame
 from bdgs_ros.mapping import growth
 from bdgs_ros.mapping.gaussians import GaussianMap, NewGaussians
-from bdgs_ros.mapping.keyframes import MapKeyframe, build_levels, shrink
+from bdgs_ros.mapping.keyframes import MapKeyframe, build_levels, most_redundant, shrink
 
 CAMERA = PinholeCamera(64, 48, 60.0, 60.0, 31.5, 23.5)
 INSERT = MappingConfig().insert
@@ -97,3 +98,10 @@ def test_shrinking_keeps_depths_measured_and_movers_present(width: int) -> None:
     assert small.frame.camera.width == width
     assert set(np.unique(small.frame.depth_m)) <= {1.0, 3.0}
     assert small.p_dynamic.max() == 255
+
+
+def test_the_keyframe_that_another_stands_in_for_is_forgotten_first() -> None:
+    kept = [keyframe(np.full((48, 64), 2.0)) for _ in range(4)]
+    for kf, x in zip(kept, (0.0, 1.0, 1.05, 3.0), strict=True):
+        kf.T_world_camera = se3.exp(np.array([x, 0, 0, 0, 0, 0]))
+    assert most_redundant(kept) in kept[1:3]

@@ -150,3 +150,14 @@ def test_switches_of_table_6_run(switch: str) -> None:
     for i, T in enumerate(poses(3)):
         mapper.process(Keyframe(wall(i * SECOND, T), T, no_prior()))
     assert mapper.render(poses(3)[2], CAMERA).silhouette.mean() > 0.9
+
+
+def test_memory_for_keyframes_is_bounded() -> None:
+    config = with_values(
+        CONFIG, {'mapping.keyframes': 5, 'mapping.window': 3, 'mapping.iterations': 2}
+    )
+    mapper = Mapper(config.mapping, config.belief)
+    for i, T in enumerate(poses(9)):
+        mapper.process(Keyframe(wall(i * SECOND, T), T, no_prior()))
+    assert len(mapper.keyframes) == 5
+    assert [kf.index for kf in mapper.keyframes[-3:]] == [6, 7, 8]

@@ -88,6 +88,9 @@ class MappingConfig:
     width: int = param(320, 'image width at which the map is optimised', unit='px', low=40)
     iterations: int = param(40, 'optimisation steps per keyframe', low=0, high=1000)
     window: int = param(8, 'newest keyframes in every optimisation', low=1, high=64)
+    keyframes: int = param(
+        64, 'keyframes whose images are kept; of others only the Gaussians', low=2, high=100000
+    )
     threads: int = param(2, 'threads of the rasteriser', low=1, high=64)
     backend: str = param('auto', 'rasteriser', choices=('auto', 'native', 'torch'))
     seed: int = param(0, 'of the choice of keyframes', low=0)
