@@ -27,7 +27,7 @@ from bdgs_ros.core.types import (
 )
 from bdgs_ros.tracking.align import Aligner, AlignResult, ImagePyramid
 from bdgs_ros.tracking.motion import MotionPredictor
-from bdgs_ros.tracking.movers import nearer_than_model
+from bdgs_ros.tracking.movers import MoverMask
 
 _log = logging.getLogger(__name__)
 
@@ -64,6 +64,7 @@ class CameraTracker:
             )
         )
         self._motion = MotionPredictor(config.motion)
+        self._movers = MoverMask(config.movers)
         self.reset()
 
     def reset(self) -> None:
@@ -72,6 +73,7 @@ class CameraTracker:
         self._model: Reference | None = None
         self._frames_since_keyframe = 0
         self._motion.reset()
+        self._movers.reset()
 
     def set_model(self, view: ModelView | None) -> None:
         """Take the static map as rendered at a keyframe, or None where there is no map."""
@@ -100,7 +102,8 @@ class CameraTracker:
 
         """
         prior = self._prior(frame, labels)
-        current = self._pyramid(frame.color, frame.depth_m, prior, frame.camera)
+        expected = np.maximum(prior, self._movers.expected(frame.camera.shape))
+        current = self._pyramid(frame.color, frame.depth_m, expected, frame.camera)
         if self._keyframe is None:
             return self._start(frame, current, prior)
         predicted, covariance = self._motion.predict(frame.stamp_ns)
@@ -167,7 +170,7 @@ class CameraTracker:
             return prior
         T_current_model = se3.inverse(coarse.T_world_camera) @ self._model.T_world_camera
         maps = self._aligner.residual_maps(self._model.pyramid, current, T_current_model)
-        return np.maximum(prior, nearer_than_model(maps, prior.shape, self._config.movers))
+        return np.maximum(prior, self._movers.update(maps, prior.shape))
 
     def _refine(
         self, current: ImagePyramid, coarse: Estimate, information: NDArray[np.float64]

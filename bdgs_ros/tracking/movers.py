@@ -38,3 +38,32 @@ def nearer_than_model(
     image = np.where(things, value, np.uint8(0))
     resized = cv2.resize(image, (shape[1], shape[0]), interpolation=cv2.INTER_NEAREST)
     return np.asarray(resized, np.uint8)
+
+
+class MoverMask:
+    """
+    What stood before the map in the last frame, where it may be expected in the next.
+
+    The coarse alignment needs to know the movers before it can see them against the map. At
+    camera rate they are about where they were.
+    """
+
+    def __init__(self, config: MoversConfig) -> None:
+        self._config = config
+        self._last: ProbabilityImage | None = None
+
+    def reset(self) -> None:
+        """Forget the last frame."""
+        self._last = None
+
+    def expected(self, shape: tuple[int, int]) -> ProbabilityImage:
+        """Return the last movers, grown by how far they may have come; 0 where unknown."""
+        if self._last is None or self._last.shape != shape:
+            return np.zeros(shape, np.uint8)
+        reach = 2 * round(self._config.reach * shape[1]) + 1
+        return np.asarray(cv2.dilate(self._last, np.ones((reach, reach), np.uint8)), np.uint8)
+
+    def update(self, maps: ResidualMaps, shape: tuple[int, int]) -> ProbabilityImage:
+        """Take the residuals of this frame and return its movers, see `nearer_than_model`."""
+        self._last = nearer_than_model(maps, shape, self._config)
+        return self._last

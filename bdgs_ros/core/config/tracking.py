@@ -102,6 +102,9 @@ class MoversConfig:
         0.003, 'smaller things are noise', unit='share of the image', low=0.0, high=1.0
     )
     p_dynamic: float = param(0.8, 'probability given to such pixels', low=0.0, high=1.0)
+    reach: float = param(
+        0.011, 'a mover comes no further in a frame', unit='share of the width', low=0.0, high=0.5
+    )
 
 
 @dataclass(frozen=True)
