@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bdgs_ros.belief.filter import logit, render_mask
-from bdgs_ros.belief.fusion import BeliefTracker, State, decide
+from bdgs_ros.belief.fusion import BeliefTracker, decide
 from bdgs_ros.core.config import BeliefConfig
 from bdgs_ros.mapping.rasterize import Gaussians
 
@@ -90,11 +90,6 @@ class GaussianMap:
     def states(self) -> NDArray[np.uint8]:
         """The decision of Eq. 6 for each Gaussian, [N]."""
         return decide(self.belief.belief, self._config.margin)
-
-    @property
-    def static_count(self) -> int:
-        """How many Gaussians Eq. 6 calls static."""
-        return int((self.states == State.STATIC).sum())
 
     def visible_mask(self) -> NDArray[np.bool_]:
         """Return M_g of Eq. 11, [N]: True where a Gaussian is rendered."""

@@ -49,8 +49,6 @@ class MapKeyframe:
     exposure_moments: list[Array] = field(
         default_factory=lambda: [np.zeros(2, np.float32), np.zeros(2, np.float32)]
     )
-    visits: int = 0
-    """How often it was optimised against."""
 
     @property
     def T_camera_world(self) -> Pose:

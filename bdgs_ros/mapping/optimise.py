@@ -90,7 +90,6 @@ class Optimiser:
         regulariser = self._add_direct_terms(gaussians, gradients, level, penalised)
         self._adam(gaussians, gradients, (result.visibility > 0) | penalised)
         self._adapt_exposure(keyframe, result.exposure_gradient)
-        keyframe.visits += 1
         return result.loss + regulariser
 
     def _opaque_enough(self, logit_opacities: Array, level_index: int) -> NDArray[np.bool_]:
