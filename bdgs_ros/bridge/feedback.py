@@ -24,6 +24,7 @@ _LABELS_KEPT = 30
 _MODELS_KEPT = 4
 _KEYFRAMES_KEPT = 300
 _ABSENT_S = 1.0
+_FIRST_ABSENT_S = 5.0  # the first message can be later than the discovery of its publisher
 
 
 class Feedback:
@@ -50,12 +51,13 @@ class Feedback:
         self._health = health
         self._labels: StampBuffer[Image] = StampBuffer(_LABELS_KEPT)
         self._models: StampBuffer[tuple[int, ModelImages]] = StampBuffer(_MODELS_KEPT)
+        self._heard: set[str] = set()
         self._keyframes: OrderedDict[int, tuple[Pose, PinholeCamera]] = OrderedDict()
         node.create_subscription(
             Image,
             topics.LABELS,
             lambda message: self._labels.put(conversions.stamp_ns(message), message),
-            topics.RELIABLE,
+            topics.KEPT,
         )
         self._subscription = ModelSubscription(
             node, lambda stamp_ns, images: self._models.put(stamp_ns, (stamp_ns, images))
@@ -88,15 +90,18 @@ class Feedback:
 
     def _wait(self, buffer: StampBuffer[Item], stamp_ns: int, topic: str) -> Item | None:
         """Wait for a stamp; not for long where nobody publishes."""
+        patience_s = _ABSENT_S if topic in self._heard else _FIRST_ABSENT_S
+        item = buffer.wait(stamp_ns, patience_s)
         present = self._node.count_publishers(topic) > 0
-        timeout_s = self._config.lockstep_timeout_s if present else _ABSENT_S
-        item = buffer.wait(stamp_ns, timeout_s)
+        if item is None and present:
+            item = buffer.wait(stamp_ns, self._config.lockstep_timeout_s - patience_s)
+        self._heard.add(topic)
         if item is None:
             state = 'its publisher is silent' if present else 'it has no publisher'
             self._health.counts['lockstep_timeouts'] += 1
             self._health.warn(
                 f"lockstep: nothing on '{self._node.resolve_topic_name(topic)}' for the frame at "
-                f'hand within {timeout_s:g} s, {state}; going on without'
+                f'hand, {state}; going on without'
             )
         return item
 

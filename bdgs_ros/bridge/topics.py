@@ -43,6 +43,12 @@ REPLAY_STEP = 'bdgs/replay/step'
 
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 """Small messages: every one counts, late ones still do."""
+KEPT = QoSProfile(
+    depth=10,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+"""Labels: those published before a subscriber was discovered still reach it."""
 LATCHED = QoSProfile(
     depth=1,
     reliability=ReliabilityPolicy.RELIABLE,

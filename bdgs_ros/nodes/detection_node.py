@@ -30,7 +30,7 @@ class DetectionNode(GraphNode):
         cv2.setNumThreads(1)
         self._health = Health(self, 'detection')
         self._stage = DetectionStage(config.detection)
-        self._labels = self.create_publisher(Image, topics.LABELS, topics.RELIABLE)
+        self._labels = self.create_publisher(Image, topics.LABELS, topics.KEPT)
         self._detections = optional.DetectionsPublisher(self)
         self._decoder = FrameDecoder.of(self)
         # Only the newest image is worth a detector's time; in lockstep, all are.

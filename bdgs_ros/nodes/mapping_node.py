@@ -78,7 +78,7 @@ class MappingNode(GraphNode):
             Image,
             topics.LABELS,
             lambda message: self._labels.put(conversions.stamp_ns(message), message),
-            topics.RELIABLE,
+            topics.KEPT,
         )
         self.create_subscription(
             PoseStamped, topics.KEYFRAME, self._queue_keyframe, topics.RELIABLE

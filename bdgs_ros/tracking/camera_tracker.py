@@ -112,7 +112,7 @@ class CameraTracker:
         p_dynamic = self._see_movers(prior, current, coarse)
         current = self._aligner.with_dynamic(current, p_dynamic)
         fine = self._refine(current, coarse, information)
-        return self._conclude(frame, current, fine, p_dynamic, predicted)
+        return self._conclude(frame, current, coarse.quality.overlap, fine, p_dynamic, predicted)
 
     def _prior(self, frame: RgbdFrame, labels: Labels | None) -> ProbabilityImage:
         if labels is None or not self._config.masked:
@@ -195,6 +195,7 @@ class CameraTracker:
         self,
         frame: RgbdFrame,
         current: ImagePyramid,
+        overlap: float,
         estimate: Estimate,
         p_dynamic: ProbabilityImage,
         predicted: Pose,
@@ -204,7 +205,7 @@ class CameraTracker:
         if not self._is_good(quality):
             return self._lost(frame, predicted, p_dynamic, quality)
         self._motion.update(frame.stamp_ns, estimate.T_world_camera, quality.covariance)
-        is_keyframe = self._needs_keyframe(estimate)
+        is_keyframe = self._needs_keyframe(estimate.T_world_camera, overlap)
         if is_keyframe:
             self._become_keyframe(frame, estimate.T_world_camera, current)
         return TrackingResult(
@@ -215,7 +216,7 @@ class CameraTracker:
             is_keyframe,
             p_dynamic,
             quality.inlier_ratio,
-            quality.overlap,
+            overlap,
         )
 
     def _lost(
@@ -244,17 +245,21 @@ class CameraTracker:
             quality.overlap,
         )
 
-    def _needs_keyframe(self, estimate: Estimate) -> bool:
-        """Choose by translation over depth, rotation, overlap and age."""
+    def _needs_keyframe(self, T_world_camera: Pose, overlap: float) -> bool:
+        """
+        Choose by translation over depth, rotation, overlap and age, all against the last keyframe.
+
+        The model view may be of an older one, when mapping is behind.
+        """
         assert self._keyframe is not None
         rules = self._config.keyframe
-        T_keyframe_current = se3.inverse(self._keyframe.T_world_camera) @ estimate.T_world_camera
+        T_keyframe_current = se3.inverse(self._keyframe.T_world_camera) @ T_world_camera
         move = float(np.linalg.norm(T_keyframe_current[:3, 3])) / self._keyframe.median_depth_m
         turn = np.rad2deg(se3.rotation_angle_rad(T_keyframe_current))
         return bool(
             move > rules.translation
             or turn > rules.rotation_deg
-            or estimate.quality.overlap < rules.overlap
+            or overlap < rules.overlap
             or self._frames_since_keyframe >= rules.max_interval
         )
 

@@ -136,3 +136,22 @@ def test_reset_starts_a_new_world(recording: tuple) -> None:
     again = tracker.process(frames[2])
     np.testing.assert_array_equal(again.T_world_camera, np.eye(4))
     assert again.is_keyframe
+
+
+def test_an_old_model_view_does_not_make_every_frame_a_keyframe(recording: tuple) -> None:
+    """Mapping is behind in real time: keyframes are counted against the last one."""
+    frames, _ = recording
+    tracker = CameraTracker(CONFIG)
+    first = tracker.process(frames[0])
+    narrow = frames[0].depth_m.copy()
+    narrow[:, 40:] = 0  # the old view shows little of what is seen now
+    view = ModelView(
+        frames[0].stamp_ns,
+        first.T_world_camera @ se3.exp(np.array([0, 0, 0, 0, 0.3, 0])),
+        CAMERA,
+        frames[0].color,
+        narrow,
+        np.zeros(CAMERA.shape, np.uint8),
+    )
+    tracker.set_model(view)
+    assert not any(tracker.process(frame).is_keyframe for frame in frames[1:6])
