@@ -17,22 +17,19 @@ Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 
-def insertion_candidates(keyframe: MapKeyframe, config: InsertConfig) -> Mask:
-    """
-    Return the pixels of the finest level that may bring a Gaussian, [H, W].
-
-    They have a usable depth, lie on no depth edge (there the sensor mixes two surfaces), and keep
-    a margin from everything that moves.
-    """
-    level = keyframe.levels[0]
-    moving = (level.weight == 0).astype(np.uint8)
+def far_from_movers(keyframe: MapKeyframe, config: InsertConfig) -> Mask:
+    """Return the pixels of the finest level that keep a margin from all that moves, [H, W]."""
+    moving = (keyframe.levels[0].weight == 0).astype(np.uint8)
     reach = 2 * config.margin_px + 1
-    far_from_movers = cv2.dilate(moving, np.ones((reach, reach), np.uint8)) == 0
-    return np.asarray(usable_depth(level.depth_m, config) & far_from_movers)
+    return np.asarray(cv2.dilate(moving, np.ones((reach, reach), np.uint8)) == 0)
 
 
 def usable_depth(depth_m: DepthImage, config: InsertConfig) -> Mask:
-    """Return the pixels of the insertion grid with a depth in range and off edges, [H, W]."""
+    """
+    Return the pixels of the insertion grid with a depth in range and off edges, [H, W].
+
+    On edges the sensor mixes two surfaces.
+    """
     in_range = (depth_m > config.min_depth) & (depth_m < config.max_depth)
     return in_range & ~depth_edges(depth_m, config.edge) & _grid(depth_m.shape, config.stride)
 
@@ -56,9 +53,7 @@ def empty_pixels(static: Rendered, config: InsertConfig) -> Mask:
     return np.asarray(static.silhouette < config.silhouette)
 
 
-def pixels_in_front(
-    depth_m: DepthImage, static: Rendered, everything: Rendered, sigma: Array, count: float
-) -> Mask:
+def pixels_in_front(depth_m: DepthImage, static: Rendered, sigma: Array, count: float) -> Mask:
     """
     Return where the camera sees something nearer than the static map, [H, W].
 
@@ -66,9 +61,8 @@ def pixels_in_front(
     ----------
     depth_m : ndarray, shape (H, W)
         Measured, metres.
-    static, everything : Rendered
-        The static map, and the map with the Gaussians that Eq. 11 hides: what these already
-        explain is not in front of anything any more.
+    static : Rendered
+        The static map.
     sigma : ndarray, shape (H, W)
         Standard deviation of the measured depth.
     count : float
@@ -76,7 +70,7 @@ def pixels_in_front(
 
     """
     nearer = (depth_m > 0) & (surface_depth(static) - depth_m > count * sigma)
-    return nearer & ~explained(depth_m, everything, sigma, count) & (static.silhouette > 0.5)
+    return np.asarray(nearer & (static.silhouette > 0.5))
 
 
 def explained(depth_m: DepthImage, everything: Rendered, sigma: Array, count: float) -> Mask:

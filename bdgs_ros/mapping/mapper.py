@@ -69,8 +69,10 @@ class Mapper:
         small = shrink(keyframe, self._config.width)
         if not self.frozen:
             self._infer(small)
-            current = self._remember(small)
-            self._insert(current)
+            static = self.render(small.T_world_camera, small.frame.camera)
+            in_front = self._in_front(small, static)
+            current = self._remember(small, in_front)
+            self._insert(current, static, in_front)
             self._optimiser.run(self.map, current, self._companions())
             self.map.keep(growth.worth_keeping(self.map, self._config.prune))
         return self._model_view(small)
@@ -116,12 +118,16 @@ class Mapper:
         seen_through = features.values[:, likelihood.FEATURES.index('free_space')] > 0
         self.map.keep(~growth.confirmed_gone(self.map, seen_through, self._belief))
 
-    def _remember(self, keyframe: Keyframe) -> MapKeyframe:
+    def _in_front(self, keyframe: Keyframe, static: Rendered) -> Mask:
+        """Return where something stands before the static map, [H, W]."""
+        depth_m = keyframe.frame.depth_m
+        count = self._config.insert.depth_sigma
+        return growth.pixels_in_front(depth_m, static, self._sigma(depth_m), count)
+
+    def _remember(self, keyframe: Keyframe, in_front: Mask) -> MapKeyframe:
+        """Keep the keyframe's images; what is labelled or stands in front does not count."""
         frame = keyframe.frame
-        moving = is_dynamic(keyframe.p_dynamic)
-        if len(self.map):
-            static = self.render(keyframe.T_world_camera, frame.camera)
-            moving |= self._in_front(keyframe, static)
+        moving = is_dynamic(keyframe.p_dynamic) | without_specks(in_front, _MIN_BLOB_SHARE)
         levels = build_levels(
             frame.color, frame.depth_m, moving, frame.camera, self._config.pyramid.levels
         )
@@ -137,47 +143,27 @@ class Mapper:
         self._count += 1
         return current
 
-    def _in_front(self, keyframe: Keyframe, static: Rendered) -> Mask:
-        """Return where something stands before the static map, without specks."""
-        depth_m = keyframe.frame.depth_m
-        nearer = (
-            (
-                growth.surface_depth(static) - depth_m
-                > self._config.insert.depth_sigma * self._sigma(depth_m)
-            )
-            & (depth_m > 0)
-            & (static.silhouette > 0.5)
-        )
-        return without_specks(nearer, _MIN_BLOB_SHARE)
-
     def _sigma(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
         config = self._belief.likelihood
         return np.asarray(config.depth_floor + config.depth_noise * depth_m**2, np.float32)
 
-    def _insert(self, current: MapKeyframe) -> None:
+    def _insert(self, current: MapKeyframe, static: Rendered, in_front: Mask) -> None:
         """Add Gaussians where the map is empty and nothing moves; and, hidden, in front of it."""
         config = self._config.insert
         level = current.levels[0]
-        if not len(self.map):
-            pixels = growth.insertion_candidates(current, config)
-            self._append(current, pixels, self._belief.initial)
-            return
-        static = self.render(current.T_world_camera, level.camera)
+        usable = growth.usable_depth(level.depth_m, config)
         everything = self.render_everything(current.T_world_camera, level.camera)
-        candidates = growth.insertion_candidates(current, config)
-        sigma = self._sigma(level.depth_m)
-        known = growth.explained(level.depth_m, everything, sigma, config.depth_sigma)
-        empty = growth.empty_pixels(static, config) & ~known
-        self._append(current, candidates & empty, self._belief.initial)
+        unknown = ~growth.explained(
+            level.depth_m, everything, self._sigma(level.depth_m), config.depth_sigma
+        )
+        empty = growth.empty_pixels(static, config) & unknown
+        still = growth.far_from_movers(current, config)
+        self._append(current, usable & still & empty, self._belief.initial)
         # What stands in front of the map and no detector names may be new furniture: it enters
         # hidden by Eq. 11, and the filter decides whether it stays.
         unnamed = ~is_dynamic(current.p_dynamic)
-        in_front = growth.pixels_in_front(
-            level.depth_m, static, everything, sigma, config.depth_sigma
-        )
-        in_front = without_specks(in_front & unnamed, _MIN_BLOB_SHARE)
-        possible = growth.usable_depth(level.depth_m, config)
-        self._append(current, in_front & possible, self._belief.initial_in_front)
+        new = without_specks(in_front & unknown & unnamed, _MIN_BLOB_SHARE)
+        self._append(current, usable & new, self._belief.initial_in_front)
 
     def _append(self, current: MapKeyframe, pixels: Mask, belief: float) -> None:
         new = growth.lift(current, pixels, belief, self._config.insert)

@@ -56,8 +56,10 @@ class Optimiser:
 
         """
         visible = gaussians.visible_mask()
+        # Gaussians that Eq. 11 hides are frozen, opacity too, so that they can come back.
+        penalised = visible & (gaussians.states == State.DYNAMIC)
         schedule = self._schedule(newest, others)
-        return [self._step(gaussians, kf, level, visible) for kf, level in schedule]
+        return [self._step(gaussians, kf, level, visible, penalised) for kf, level in schedule]
 
     def _schedule(
         self, newest: MapKeyframe, others: Sequence[MapKeyframe]
@@ -80,13 +82,12 @@ class Optimiser:
         keyframe: MapKeyframe,
         level_index: int,
         visible: NDArray[np.bool_],
+        penalised: NDArray[np.bool_],
     ) -> float:
         level = keyframe.levels[level_index]
         active = visible & self._opaque_enough(gaussians.logit_opacities, level_index)
         result = self._photometric(gaussians, keyframe, level, active)
         gradients = dict(zip(PARAMETERS, result.gradients.parameters(), strict=True))
-        # Gaussians that Eq. 11 hides are frozen, opacity too, so that they can come back.
-        penalised = visible & (gaussians.states == State.DYNAMIC)
         regulariser = self._add_direct_terms(gaussians, gradients, level, penalised)
         self._adam(gaussians, gradients, (result.visibility > 0) | penalised)
         self._adapt_exposure(keyframe, result.exposure_gradient)
@@ -155,8 +156,5 @@ class Optimiser:
         """Fit gain and offset of a keyframe; the first keyframe defines the map's exposure."""
         if keyframe.index == 0:
             return
-        rows = np.ones(2, bool)
         moments = keyframe.exposure_moments
-        adam_step(
-            keyframe.exposure, gradient, *moments, rate=self._config.rate.exposure, rows=rows
-        )
+        adam_step(keyframe.exposure, gradient, *moments, rate=self._config.rate.exposure)

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bdgs_ros.core import se3
-from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.config import TrackingConfig
 from bdgs_ros.core.types import (
     Labels,
@@ -36,10 +35,8 @@ _log = logging.getLogger(__name__)
 class Reference:
     """An image with depth and known pose that frames are aligned to."""
 
-    stamp_ns: int
     T_world_camera: Pose
     pyramid: ImagePyramid
-    median_depth_m: float
 
 
 @dataclass(frozen=True)
@@ -71,6 +68,7 @@ class CameraTracker:
         """Forget everything; the next frame is the first, and the origin of the world."""
         self._keyframe: Reference | None = None
         self._model: Reference | None = None
+        self._keyframe_depth_m = 1.0
         self._frames_since_keyframe = 0
         self._motion.reset()
         self._movers.reset()
@@ -79,10 +77,8 @@ class CameraTracker:
         """Take the static map as rendered at a keyframe, or None where there is no map."""
         if view is None:
             return
-        pyramid = self._pyramid(view.color, view.depth_m, view.p_dynamic, view.camera)
-        self._model = Reference(
-            view.stamp_ns, view.T_world_camera, pyramid, _median_depth(view.depth_m)
-        )
+        pyramid = self._aligner.pyramid(view.color, view.depth_m, view.p_dynamic, view.camera)
+        self._model = Reference(view.T_world_camera, pyramid)
 
     def process(self, frame: RgbdFrame, labels: Labels | None = None) -> TrackingResult:
         """
@@ -103,7 +99,7 @@ class CameraTracker:
         """
         prior = self._prior(frame, labels)
         expected = np.maximum(prior, self._movers.expected(frame.camera.shape))
-        current = self._pyramid(frame.color, frame.depth_m, expected, frame.camera)
+        current = self._aligner.pyramid(frame.color, frame.depth_m, expected, frame.camera)
         if self._keyframe is None:
             return self._start(frame, current, prior)
         predicted, covariance = self._motion.predict(frame.stamp_ns)
@@ -118,15 +114,6 @@ class CameraTracker:
         if labels is None or not self._config.masked:
             return np.zeros(frame.camera.shape, np.uint8)
         return labels.p_dynamic
-
-    def _pyramid(
-        self,
-        color: NDArray[np.uint8],
-        depth_m: NDArray[np.float32],
-        p_dynamic: ProbabilityImage,
-        camera: PinholeCamera,
-    ) -> ImagePyramid:
-        return self._aligner.pyramid(color, depth_m, p_dynamic, camera)
 
     def _start(
         self, frame: RgbdFrame, current: ImagePyramid, p_dynamic: ProbabilityImage
@@ -254,7 +241,7 @@ class CameraTracker:
         assert self._keyframe is not None
         rules = self._config.keyframe
         T_keyframe_current = se3.inverse(self._keyframe.T_world_camera) @ T_world_camera
-        move = float(np.linalg.norm(T_keyframe_current[:3, 3])) / self._keyframe.median_depth_m
+        move = float(np.linalg.norm(T_keyframe_current[:3, 3])) / self._keyframe_depth_m
         turn = np.rad2deg(se3.rotation_angle_rad(T_keyframe_current))
         return bool(
             move > rules.translation
@@ -266,9 +253,8 @@ class CameraTracker:
     def _become_keyframe(
         self, frame: RgbdFrame, T_world_camera: Pose, pyramid: ImagePyramid
     ) -> None:
-        self._keyframe = Reference(
-            frame.stamp_ns, T_world_camera, pyramid, _median_depth(frame.depth_m)
-        )
+        self._keyframe = Reference(T_world_camera, pyramid)
+        self._keyframe_depth_m = _median_depth(frame.depth_m)
         self._frames_since_keyframe = 0
 
 

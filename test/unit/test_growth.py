@@ -22,10 +22,14 @@ def keyframe(depth: np.ndarray, moving: np.ndarray | None = None) -> MapKeyframe
     return MapKeyframe(0, 0, np.eye(4), np.zeros(CAMERA.shape, np.uint8), levels)
 
 
+def candidates_of(kf: MapKeyframe) -> np.ndarray:
+    return growth.usable_depth(kf.levels[0].depth_m, INSERT) & growth.far_from_movers(kf, INSERT)
+
+
 def test_nothing_comes_from_movers_or_their_margin() -> None:
     moving = np.zeros(CAMERA.shape, bool)
     moving[10:20, 10:20] = True
-    candidates = growth.insertion_candidates(keyframe(np.full((48, 64), 2.0), moving), INSERT)
+    candidates = candidates_of(keyframe(np.full((48, 64), 2.0), moving))
     margin = INSERT.margin_px
     assert not candidates[10 - margin : 20 + margin, 10 - margin : 20 + margin].any()
     assert candidates.sum() > 300
@@ -36,7 +40,7 @@ def test_nothing_comes_from_edges_or_bad_depth() -> None:
     depth[:, 32:] = 3.0
     depth[5:10] = 0
     depth[40:] = INSERT.max_depth + 1
-    candidates = growth.insertion_candidates(keyframe(depth), INSERT)
+    candidates = candidates_of(keyframe(depth))
     assert not candidates[:, 31:33].any()
     assert not candidates[5:10].any()
     assert not candidates[40:].any()
