@@ -6,8 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bdgs_ros.core.types import (
+    DYNAMIC_THRESHOLD,
     Pose,
     ProbabilityImage,
     RgbdFrame,
@@ -40,6 +42,11 @@ class Sample:
     T_world_camera: Pose
     p_dynamic: ProbabilityImage
     is_keyframe: bool
+
+    @property
+    def static(self) -> NDArray[np.bool_]:
+        """Which pixels the run did not call dynamic, shape (H, W)."""
+        return np.asarray(self.p_dynamic < DYNAMIC_THRESHOLD)
 
 
 @dataclass(frozen=True)
@@ -89,7 +96,8 @@ class Recorder:
     Collect the rows and an even choice of samples from a run of unknown length.
 
     Whenever `max_samples` is exceeded every second sample is dropped and the stride doubles, so
-    the samples stay evenly spaced and memory bounded (2.5 MB per sample of 640x480).
+    the samples stay evenly spaced and memory bounded (2.5 MB per sample of 640x480). With
+    `max_samples` 0 there are none.
     """
 
     max_samples: int = 40
@@ -101,7 +109,7 @@ class Recorder:
         self, frame: RgbdFrame, tracking: TrackingResult, times_ms: Mapping[str, float]
     ) -> None:
         """Take the outcome of one frame."""
-        if len(self.rows) % self._stride == 0:
+        if self.max_samples and len(self.rows) % self._stride == 0:
             self._sample(frame, tracking)
         self.rows.append(
             FrameRow(

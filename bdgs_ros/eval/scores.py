@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.errors import EvaluationError
 from bdgs_ros.core.types import (
-    DYNAMIC_THRESHOLD,
     ColorImage,
     DepthImage,
     Pose,
@@ -75,15 +74,17 @@ class View:
     silhouette: NDArray[np.float32]
 
 
+def render_view(sample: Sample, renderer: Renderer) -> View:
+    """Render the static map, as it is now, at the estimated pose of a sample."""
+    render = renderer.render(sample.T_world_camera, sample.frame.camera)
+    seen = render.silhouette > _SEEN
+    depth_m = np.where(seen, render.depth / np.maximum(render.silhouette, _SEEN), 0.0)
+    return View(sample, render.color, depth_m.astype(np.float32), render.silhouette)
+
+
 def render_samples(samples: Sequence[Sample], renderer: Renderer) -> list[View]:
     """Render the final static map at the estimated pose of every sample."""
-    views = []
-    for sample in samples:
-        render = renderer.render(sample.T_world_camera, sample.frame.camera)
-        seen = render.silhouette > _SEEN
-        depth_m = np.where(seen, render.depth / np.maximum(render.silhouette, _SEEN), 0.0)
-        views.append(View(sample, render.color, depth_m.astype(np.float32), render.silhouette))
-    return views
+    return [render_view(sample, renderer) for sample in samples]
 
 
 def trajectory_metrics(
@@ -134,13 +135,45 @@ def render_metrics(views: Sequence[View], truth: Truth | None = None) -> list[Me
     chosen = [v for v in views if not v.sample.is_keyframe] or list(views)
     if not chosen:
         return []
-    scores = [_against_input(v) if truth is None else _against_truth(v, truth) for v in chosen]
+    return mean_scores([score_view(view, truth) for view in chosen])
+
+
+def score_view(
+    view: View, truth: Truth | None = None, static: NDArray[np.bool_] | None = None
+) -> dict[str, float]:
+    """
+    Score one render; `render_metrics` is the mean of these.
+
+    Parameters
+    ----------
+    view : View
+        Render and frame.
+    truth : Truth, optional
+        Its static view is what the render is compared with; without it, the frame itself.
+    static : ndarray of bool, shape (H, W), optional
+        Pixels that count where truth is not known; by default those not called dynamic.
+
+    Returns
+    -------
+    scores : dict
+        The keys of `render_metrics`, in the units named there; NaN where nothing is known.
+
+    """
+    if truth is not None:
+        return _against_truth(view, truth)
+    return _against_input(view, view.sample.static if static is None else static)
+
+
+def mean_scores(scores: Sequence[Mapping[str, float]]) -> list[Metric]:
+    """Return the mean of each score over the views in which it is known, and how many views."""
+    if not scores:
+        return []
     metrics = [
         Metric(name, _mean([score[name] for score in scores]), unit)
         for name, unit in _UNITS.items()
         if name in scores[0]
     ]
-    return [*metrics, Metric('views_scored', len(chosen))]
+    return [*metrics, Metric('views_scored', len(scores))]
 
 
 _UNITS = {
@@ -161,9 +194,8 @@ def _against_truth(view: View, truth: Truth) -> dict[str, float]:
     return {**scores, 'psnr_hidden': rendering.psnr(view.color, color, hidden)}
 
 
-def _against_input(view: View) -> dict[str, float]:
+def _against_input(view: View, static: NDArray[np.bool_]) -> dict[str, float]:
     frame: RgbdFrame = view.sample.frame
-    static = view.sample.p_dynamic < DYNAMIC_THRESHOLD
     return _scores(view, frame.color, frame.depth_m, static)
 
 
