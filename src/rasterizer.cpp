@@ -5,8 +5,11 @@
 //
 //   alpha_i = min(0.99, o_i exp(-1/2 d^T S_i^-1 d))      skipped below 1/255
 //   w_i     = alpha_i T_i,  T_{i+1} = T_i (1 - alpha_i),  T_0 = 1,  stop once T_i < 1e-4
-//   color   = sum w_i c_i      depth = sum w_i z_i       (z_i: camera z of the centre)
+//   color   = sum w_i c_i      depth = sum w_i (z_i + zeta_i . d)
 //   silhouette = sum w_i       dynamic = sum w_i p_i
+//
+// The depth is where the pixel's ray meets the Gaussian, not the z of its centre: the mean of its
+// z given the pixel (rasterizer_project.hpp), so that a slanted wall renders as a slanted wall.
 //
 // How it is laid out. The image is cut into tiles of 16 x 16 px and those into blocks of kLanes
 // pixels (4 x 4 with AVX-512, else 4 x 2): one vector is one block.
@@ -25,9 +28,9 @@
 //             sum_{j > i} w_j u_j, which is the pixel's total minus what has been walked:
 //                 dL/dalpha_i = T_i u_i - R_i / (1 - alpha_i)
 //             All a Gaussian needs of a block are linear functions of two vectors, w and
-//             g = alpha dL/dalpha: six moments of g and five sums of w. So the block's pixel
+//             g = alpha dL/dalpha: six moments of g and seven sums of w. So the block's pixel
 //             coordinates and gradients form a matrix with one row of 16 outputs per pixel, and
-//             the reduction over pixels is a matrix product instead of 11 horizontal sums.
+//             the reduction over pixels is a matrix product instead of 13 horizontal sums.
 //             Sums go to the tile's slots.
 //   gather    per Gaussian: add its slots in order, and go back through the projection.
 //
@@ -66,7 +69,7 @@ constexpr int kRadixBits = 12, kRadix = 1 << kRadixBits;
 
 // alpha = exp2(l + a dx^2 + b dx dy + c dy^2), and what is blended with it.
 struct alignas(64) Record {
-  float u, v, a, b, c, l, red, green, blue, z, p_dynamic, unused[5];
+  float u, v, a, b, c, l, red, green, blue, z, zeta_u, zeta_v, p_dynamic, unused[3];
 };
 
 struct Box {  // pixels, inclusive
@@ -214,7 +217,7 @@ class Rasterizer {
     const Mask key = (bits_of(e.z) - bits_of(splat(kNear))) >> 3;
 
     const Lanes scale = (-0.5f * kLog2E) * e.inverse_det;
-    alignas(64) float fields[8][kLanes];
+    alignas(64) float fields[9][kLanes];
     store(fields[0], e.u);
     store(fields[1], e.v);
     store(fields[2], scale * e.s11);
@@ -222,6 +225,8 @@ class Rasterizer {
     store(fields[4], scale * e.s00);
     store(fields[5], l);
     store(fields[6], e.z);
+    store(fields[7], e.zeta_u);
+    store(fields[8], e.zeta_v);
     for (int lane = 0; lane < lanes; ++lane) {
       const size_t id = i + lane;
       const float* color = in.colors + 3 * id;
@@ -244,6 +249,8 @@ class Rasterizer {
       r.green = color[1];
       r.blue = color[2];
       r.z = fields[6][lane];
+      r.zeta_u = fields[7][lane];
+      r.zeta_v = fields[8][lane];
       r.p_dynamic = in.p_dynamic[id];
     }
   }
@@ -411,7 +418,7 @@ class Rasterizer {
       red += w * r.red;
       green += w * r.green;
       blue += w * r.blue;
-      depth += w * r.z;
+      depth += w * (r.z + r.zeta_u * dx + r.zeta_v * dy);
       dynamic += w * r.p_dynamic;
       if (kStatistics) {
         scratch.sums[2 * list[k]] += sum(w);
@@ -499,8 +506,9 @@ class Rasterizer {
     const Lanes px = pixel_x(block), py = pixel_y(block);
     for (int l = 0; l < kLanes; ++l) {
       const float x = px[l], y = py[l];
-      const float row[kOutputs] = {1.0f,     x,          y,         x * x,      x * y, y * y, 0, 0,
-                                   g_red[l], g_green[l], g_blue[l], g_depth[l], 1.0f,  0,     0, 0};
+      const float row[kOutputs] = {
+          1.0f,     x,          y,         x * x,      x * y,          y * y,          0,    0,
+          g_red[l], g_green[l], g_blue[l], g_depth[l], g_depth[l] * x, g_depth[l] * y, 1.0f, 0};
       std::memcpy(matrix.row[l], row, sizeof(row));
     }
     Lanes rest = g_red * load_block(plane(kRed) + at) + g_green * load_block(plane(kGreen) + at) +
@@ -514,7 +522,8 @@ class Rasterizer {
       const Record& r = records[locals[k]];
       const Lanes alpha = load(alphas + static_cast<size_t>(k) * kLanes);
       const Lanes w = alpha * T;
-      const Lanes u = g_red * r.red + g_green * r.green + g_blue * r.blue + g_depth * r.z +
+      const Lanes z = r.z + r.zeta_u * (px - r.u) + r.zeta_v * (py - r.v);
+      const Lanes u = g_red * r.red + g_green * r.green + g_blue * r.blue + g_depth * z +
                       g_silhouette;
       rest -= w * u;
       // g = alpha dL/dalpha; a clamped alpha does not move with the Gaussian
@@ -565,6 +574,8 @@ class Rasterizer {
     out[4] = in[4] - u * y - v * (x - u * g);
     out[5] = in[5] - v * (2.0f * y - v * g);
     std::memcpy(out + 6, in + 6, 10 * sizeof(float));
+    out[12] = in[12] - u * in[11];
+    out[13] = in[13] - v * in[11];
   }
 
   // ---- gather ----------------------------------------------------------------------------------
@@ -611,7 +622,9 @@ class Rasterizer {
     m.gyy = load(columns[5]);
     for (int k = 0; k < 3; ++k) m.color[k] = load(columns[8 + k]);
     m.depth = load(columns[11]);
-    m.weight = load(columns[12]);
+    m.depth_x = load(columns[12]);
+    m.depth_y = load(columns[13]);
+    m.weight = load(columns[14]);
     return true;
   }
 

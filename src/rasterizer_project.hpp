@@ -6,6 +6,10 @@
 //   U = J M         J is the Jacobian of the projection at p, with x/z and y/z held inside the
 //                   image widened by 0.15 of its size on each side (1.3 times the field of view)
 //   S = U U^T + 0.3 covariance in the image in px^2, widened by a low-pass filter
+//   zeta = S^-1 U m m is the row of M for camera z, so U m is the covariance of z with the image
+//                   position: z + zeta . (pixel - centre) is the mean of z given the pixel. On a
+//                   flat Gaussian that is its tangent plane; the low-pass keeps edge-on ones
+//                   bounded, by sqrt(var z) per standard deviation of S.
 //
 // det S is summed from positive terms, |U0 x U1|^2 + 0.3 (|U0|^2 + |U1|^2) + 0.09, because
 // S00 S11 - S01^2 cancels in float32 for long thin ellipses.
@@ -83,6 +87,7 @@ struct Ellipses {
   Mask clamped_x, clamped_y;
   Lanes U[6];
   Lanes s00, s01, s11, inverse_det;      // S and 1 / det S
+  Lanes zeta_u, zeta_v;                  // dz/du and dz/dv, m per px
   Lanes opacity;
 };
 
@@ -158,13 +163,20 @@ inline void project(const Parameters& in, int i, const View& view, Ellipses& e) 
   e.s11 = bb + kLowPass;
   e.inverse_det = 1.0f / (cross[0] * cross[0] + cross[1] * cross[1] + cross[2] * cross[2] +
                           kLowPass * (aa + bb) + kLowPass * kLowPass);
+
+  const Lanes* m = e.M + 6;
+  const Lanes c0 = m[0] * a[0] + m[1] * a[1] + m[2] * a[2];
+  const Lanes c1 = m[0] * b[0] + m[1] * b[1] + m[2] * b[2];
+  e.zeta_u = (e.s11 * c0 - e.s01 * c1) * e.inverse_det;
+  e.zeta_v = (e.s00 * c1 - e.s01 * c0) * e.inverse_det;
 }
 
 // What the pixels say about kLanes Gaussians: sums over pixels, with g = dL/d(exponent),
 // d = pixel - centre in px, w = blending weight.
 struct Moments {
   Lanes g, gx, gy, gxx, gxy, gyy;  // g, g dx, g dy, g dx^2, g dx dy, g dy^2
-  Lanes color[3], depth;           // w dL/dcolor, w dL/ddepth
+  Lanes color[3];                  // w dL/dcolor
+  Lanes depth, depth_x, depth_y;   // q, q dx, q dy with q = w dL/ddepth
   Lanes weight;                    // w
 };
 
@@ -193,21 +205,27 @@ inline void project_backward(const Ellipses& e, const View& view, const Moments&
   // exponent = -1/2 d^T K d with K = S^-1
   const Lanes k00 = e.s11 * e.inverse_det, k01 = -e.s01 * e.inverse_det,
               k11 = e.s00 * e.inverse_det;
-  const Lanes du = k00 * m.gx + k01 * m.gy, dv = k01 * m.gx + k11 * m.gy;
+  const Lanes du = k00 * m.gx + k01 * m.gy - e.zeta_u * m.depth;
+  const Lanes dv = k01 * m.gx + k11 * m.gy - e.zeta_v * m.depth;
   // dL/dS = 1/2 K (sum g d d^T) K
   const Lanes p00 = k00 * m.gxx + k01 * m.gxy, p01 = k00 * m.gxy + k01 * m.gyy;
   const Lanes p10 = k01 * m.gxx + k11 * m.gxy, p11 = k01 * m.gxy + k11 * m.gyy;
-  const Lanes h00 = p00 * k00 + p01 * k01, h01 = p00 * k01 + p01 * k11,
-              h11 = p10 * k01 + p11 * k11;  // 2 dL/dS
+  Lanes h00 = p00 * k00 + p01 * k01, h01 = p00 * k01 + p01 * k11,
+        h11 = p10 * k01 + p11 * k11;  // 2 dL/dS
+  // zeta = K c with c = U m: dL/dc = K dL/dzeta = r, and dL/dS gets -1/2 (r zeta^T + zeta r^T)
+  const Lanes r0 = k00 * m.depth_x + k01 * m.depth_y, r1 = k01 * m.depth_x + k11 * m.depth_y;
+  h00 -= 2.0f * r0 * e.zeta_u;
+  h01 -= r0 * e.zeta_v + r1 * e.zeta_u;
+  h11 -= 2.0f * r1 * e.zeta_v;
 
   const Lanes jx = view.fx * e.inverse_z, jy = view.fy * e.inverse_z;
   Lanes dM[9], dslope_x = Lanes{}, dslope_y = Lanes{}, djx = Lanes{}, djy = Lanes{};
   for (int c = 0; c < 3; ++c) {
-    const Lanes dU0 = h00 * e.U[c] + h01 * e.U[3 + c];
-    const Lanes dU1 = h01 * e.U[c] + h11 * e.U[3 + c];
+    const Lanes dU0 = h00 * e.U[c] + h01 * e.U[3 + c] + r0 * e.M[6 + c];
+    const Lanes dU1 = h01 * e.U[c] + h11 * e.U[3 + c] + r1 * e.M[6 + c];
     dM[c] = jx * dU0;
     dM[3 + c] = jy * dU1;
-    dM[6 + c] = -(e.slope_x * dM[c] + e.slope_y * dM[3 + c]);
+    dM[6 + c] = r0 * e.U[c] + r1 * e.U[3 + c] - (e.slope_x * dM[c] + e.slope_y * dM[3 + c]);
     dslope_x -= dM[c] * e.M[6 + c];
     dslope_y -= dM[3 + c] * e.M[6 + c];
     djx += dU0 * e.U[c];  // U0 = jx (...), so this is jx dL/djx

@@ -45,7 +45,8 @@ class Splats:
     centre: Tensor  # [N, 2] px
     conic: Tensor  # [N, 3] inverse covariance: xx, xy, yy
     opacity: Tensor  # [N]
-    values: Tensor  # [N, 6] what is blended: colour, depth, 1, p_dynamic
+    values: Tensor  # [N, 6] what is blended: colour, depth at the centre, 1, p_dynamic
+    depth_slope: Tensor  # [N, 2] metres per px: change of depth with the pixel
     half: Tensor  # [N, 2] half sizes of the box in which alpha >= 1/255, px
     visible: Tensor  # [N] bool
 
@@ -93,6 +94,7 @@ def project(
     det = xx * yy - xy * xy
     centre = focal * slope + offset
     opacity = torch.sigmoid(logits)
+    conic = torch.stack([yy, -xy, xx], dim=1) / det[:, None]
     half = _half_sizes(opacity, torch.stack([xx, yy], dim=1)).detach()
     first = (centre - half).detach().ceil().clamp_min(0)  # pixel centres in the box
     last = torch.minimum((centre + half).detach().floor(), size - 1)
@@ -101,12 +103,21 @@ def project(
     values = [colors, z[:, None], torch.ones_like(z)[:, None], p_dynamic[:, None]]
     return Splats(
         centre,
-        torch.stack([yy, -xy, xx], dim=1) / det[:, None],
+        conic,
         opacity,
         torch.cat(values, dim=1),
+        _depth_slope(conic, U, M[:, 2]),
         half,
         visible,
     )
+
+
+def _depth_slope(conic: Tensor, U: Tensor, M_z: Tensor) -> Tensor:
+    """Return S^-1 cov(image position, z): z given the pixel moves by this much per px, [N, 2]."""
+    c = (U @ M_z[..., None])[..., 0]
+    along_u = conic[:, 0] * c[:, 0] + conic[:, 1] * c[:, 1]
+    along_v = conic[:, 1] * c[:, 0] + conic[:, 2] * c[:, 1]
+    return torch.stack([along_u, along_v], dim=1)
 
 
 def _half_sizes(opacity: Tensor, variances: Tensor) -> Tensor:
@@ -144,7 +155,10 @@ def blend(splats: Splats, order: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor
     through = torch.cumprod(1 - alpha, dim=1)
     before = torch.cat([torch.ones_like(through[:, :1]), through[:, :-1]], dim=1)
     weights = torch.where(before >= MIN_TRANSMITTANCE, alpha * before, torch.zeros_like(alpha))
-    return weights @ splats.values[order], weights
+    values = weights @ splats.values[order]
+    beside = (weights * (d * splats.depth_slope[order]).sum(dim=2)).sum(dim=1)
+    depth = values[:, _DEPTH] + beside
+    return torch.cat([values[:, _COLOR], depth[:, None], values[:, _SILHOUETTE:]], dim=1), weights
 
 
 @dataclass(frozen=True)
@@ -259,7 +273,7 @@ class _View:
         """Carry derivatives by the images, [H, W, 6], back to the parameters and the pose."""
         names = [f.name for f in fields(Splats)]
         cut = {name: getattr(self.splats, name).detach() for name in names}
-        differentiated = ('centre', 'conic', 'opacity', 'values')
+        differentiated = ('centre', 'conic', 'opacity', 'values', 'depth_slope')
         for name in differentiated:
             cut[name].requires_grad_()
         splats = Splats(**cut)

@@ -47,7 +47,8 @@ class Rendered:
     """
     One view of the Gaussians on black; the last three fields only if statistics were asked for.
 
-    Depth and p_dynamic are sums of weights times values: divide by `silhouette` for means.
+    Depth and p_dynamic are sums of weights times values: divide by `silhouette` for means. The
+    depth of a Gaussian is the mean of its z given the pixel, not the z of its centre.
     """
 
     color: Array  # [H, W, 3] RGB

@@ -295,6 +295,57 @@ def test_one_opaque_gaussian_is_where_it_should_be(name: str) -> None:
     assert seen.radius[0] == pytest.approx(np.sqrt(2 * np.log(255) * variance), rel=1e-5)
 
 
+def slanted_disc(log_scales: tuple[float, float, float]) -> Gaussians:
+    """One Gaussian 2 m ahead, turned by 45 degrees about y: its own x-axis goes away from us."""
+    half = np.pi / 8
+    quat = [np.cos(half), 0, -np.sin(half), 0]
+    row = ([[0.0, 0.0, 2.0]], [quat], [log_scales], [20.0], [[0.2, 0.4, 0.6]], [0.5])
+    return Gaussians(*(np.array(a, np.float32) for a in row))
+
+
+@pytest.mark.parametrize('name', available_backends())
+def test_depth_of_a_slanted_disc_is_its_plane(name: str) -> None:
+    """Mean of z given the pixel: the plane's slope, 2 m / 40 px, but for the low-pass filter."""
+    camera = PinholeCamera(32, 24, 40.0, 40.0, 16.0, 12.0)
+    g = slanted_disc((np.log(0.3), np.log(0.2), -9.0))
+    seen = render(g, np.eye(4), camera, backend=name)
+    depth = seen.depth / np.maximum(seen.silhouette, 1e-9)
+    variance_z = 0.3**2 / 2
+    variance_u = variance_z * (40 / 2) ** 2
+    slope = variance_z * (40 / 2) / (variance_u + 0.3)
+    assert slope == pytest.approx(2 / 40, rel=0.02)
+    columns = np.arange(9, 24)
+    np.testing.assert_allclose(depth[12, columns], 2 + slope * (columns - 16), rtol=1e-5)
+    np.testing.assert_allclose(depth[8:17, 16], 2, rtol=1e-5)
+
+
+@pytest.mark.parametrize('name', available_backends())
+def test_depth_of_a_disc_seen_edge_on_is_bounded(name: str) -> None:
+    """Its plane runs along the ray: |z - centre| <= sigma_z sqrt(2 ln(255 o)), here 3.33 sigma."""
+    camera = PinholeCamera(32, 24, 40.0, 40.0, 16.0, 12.0)
+    half = np.pi / 4 - 1e-3
+    quat = np.array([[np.cos(half), 0, -np.sin(half), 0]], np.float32)
+    g = replace(slanted_disc((np.log(0.3), np.log(0.2), -9.0)), quats=quat)
+    seen = render(g, np.eye(4), camera, backend=name)
+    drawn = seen.silhouette > 0
+    depth = seen.depth[drawn] / seen.silhouette[drawn]
+    assert drawn.sum() > 20
+    assert np.abs(depth - 2).max() < 3.33 * 0.3
+
+
+@pytest.mark.parametrize('name', available_backends())
+@pytest.mark.parametrize('log_scales', [(1.0, -12.0, -12.0), (-12.0, -12.0, -12.0), (2, 2, -20.0)])
+def test_depth_gradients_of_needles_and_sheets_are_finite(
+    name: str, log_scales: tuple[float, float, float]
+) -> None:
+    """Metres long and micrometres thick."""
+    g = slanted_disc(log_scales)
+    zeros, ones = np.zeros((*CAMERA.shape, 3)), np.ones(CAMERA.shape)
+    result = backward(g, np.eye(4), CAMERA, zeros, ones, 0 * ones, backend=name)
+    assert all(np.isfinite(a).all() for a in result.parameters())
+    assert np.isfinite(result.pose).all() and result.pose.any()
+
+
 @native
 @pytest.mark.parametrize('argument', ['means', 'quats', 'colors', 'p_dynamic'])
 def test_wrong_gaussian_shape_is_named(argument: str) -> None:
