@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
@@ -11,6 +9,7 @@ import numpy as np
 
 from bdgs_ros.core import se3
 from bdgs_ros.core.errors import DatasetError
+from bdgs_ros.core.files import write_text
 from bdgs_ros.core.types import StampedPose, Trajectory
 
 NS_PER_S = 1_000_000_000
@@ -107,15 +106,7 @@ def _format_pose(pose: StampedPose) -> str:
 
 def write_text_atomically(path: Path, text: str) -> None:
     """Write a text file aside, then rename it over the old one; `DatasetError` if it fails."""
-    temporary: str | None = None
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f'.{path.name}.')
-        with os.fdopen(descriptor, 'w', encoding='utf-8') as file:
-            file.write(text)
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
+        write_text(path, text)
     except OSError as error:
-        if temporary is not None:
-            Path(temporary).unlink(missing_ok=True)
         raise DatasetError(f"cannot write '{path}': {error}") from error

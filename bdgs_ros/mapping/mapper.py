@@ -15,6 +15,7 @@ from bdgs_ros.core.images import without_specks
 from bdgs_ros.core.types import Keyframe, ModelView, Pose, ProbabilityImage
 from bdgs_ros.mapping import growth
 from bdgs_ros.mapping.gaussians import GaussianMap
+from bdgs_ros.mapping.keyframe_store import KeyframeSet
 from bdgs_ros.mapping.keyframes import (
     MapKeyframe,
     build_levels,
@@ -22,8 +23,8 @@ from bdgs_ros.mapping.keyframes import (
     most_redundant,
     shrink,
 )
+from bdgs_ros.mapping.map_files import load_map, save_map
 from bdgs_ros.mapping.optimise import Optimiser
-from bdgs_ros.mapping.ply import load_ply, save_ply
 from bdgs_ros.mapping.rasterize import Rendered, render
 
 Mask = NDArray[np.bool_]
@@ -46,6 +47,7 @@ class Mapper:
         """Forget the map."""
         self.map = GaussianMap(self._belief)
         self.keyframes: list[MapKeyframe] = []
+        self.keyframe_stamps_ns: list[int] = []  # of all that ever were, for the scores
         self._count = 0
         self._rng = np.random.default_rng(self._config.seed)
 
@@ -75,7 +77,7 @@ class Mapper:
             self._insert(current, static, in_front)
             self._optimiser.run(self.map, current, self._companions())
             self.map.keep(growth.worth_keeping(self.map, self._config.prune))
-        return self._model_view(small)
+        return self.view(small.frame.stamp_ns, small.T_world_camera, small.frame.camera)
 
     def render(self, T_world_camera: Pose, camera: PinholeCamera) -> Rendered:
         """Render the static map: what Eq. 11 lets through."""
@@ -137,6 +139,7 @@ class Mapper:
         if self.keyframes:
             current.exposure = self.keyframes[-1].exposure.copy()
         self.keyframes.append(current)
+        self.keyframe_stamps_ns.append(current.stamp_ns)
         if len(self.keyframes) > max(self._config.keyframes, self._config.window):
             older = self.keyframes[: -self._config.window]
             self.keyframes.remove(most_redundant(older))
@@ -179,31 +182,57 @@ class Mapper:
             window = window + [older[i] for i in chosen]
         return [window[i] for i in self._rng.permutation(len(window))]
 
-    def _model_view(self, keyframe: Keyframe) -> ModelView:
+    def view(self, stamp_ns: int, T_world_camera: Pose, camera: PinholeCamera) -> ModelView:
         """Render what tracking gets back: the static map and its posterior, as topics carry it."""
-        camera = keyframe.frame.camera
-        static = self.render(keyframe.T_world_camera, camera)
+        static = self.render(T_world_camera, camera)
         known = static.silhouette > self._config.model.silhouette
         safe = np.maximum(static.silhouette, np.float32(1e-6))
         color = static.color / safe[..., None]
         return ModelView(
-            keyframe.frame.stamp_ns,
-            keyframe.T_world_camera,
+            stamp_ns,
+            T_world_camera,
             camera,
             np.where(known[..., None], np.clip(color * 255 + 0.5, 0, 255), 0).astype(np.uint8),
             np.where(known, static.depth / safe, 0).astype(np.float32),
             _to_probability_image(np.asarray(static.p_dynamic / safe, np.float32)),
         )
 
-    def save(self, path: Path) -> None:
-        """Write the map as .ply; raises `MapError`."""
-        save_ply(Path(path), self.map)
+    def save(self, path: Path, *, keyframes: bool = True) -> None:
+        """
+        Write the map as .ply and, in a folder beside it, the keyframes it was fitted to.
+
+        Parameters
+        ----------
+        path : Path
+            Of the .ply; the folder is `bdgs_ros.mapping.map_files.keyframe_folder(path)`.
+        keyframes : bool
+            Whether to keep the images, without which a map cannot be refined.
+
+        Raises
+        ------
+        MapError
+            If something cannot be written; the old files are still there then.
+
+        """
+        kept = KeyframeSet(self.keyframes, self.keyframe_stamps_ns, self._count)
+        save_map(Path(path), self.map, kept if keyframes else None)
 
     def load(self, path: Path) -> None:
-        """Replace the map by one from a .ply; raises `MapError`, and then keeps the old one."""
-        loaded = load_ply(Path(path), self._belief)
+        """
+        Replace the map by a saved one; new keyframes continue after those it was made of.
+
+        Raises
+        ------
+        MapError
+            If it cannot be read; the mapper then keeps the map it has.
+
+        """
+        loaded, kept = load_map(Path(path), self._belief, self._config.pyramid.levels)
         self.reset()
         self.map = loaded
+        self.keyframes = list(kept.keyframes)
+        self.keyframe_stamps_ns = list(kept.stamps_ns)
+        self._count = kept.next_index
 
 
 def _to_probability_image(p_dynamic: NDArray[np.float32]) -> ProbabilityImage:

@@ -3,12 +3,13 @@ Maps as files: the standard 3DGS .ply, with the filter's state as further proper
 
 Layout of the reference implementation (Kerbl et al. 2023) with spherical harmonics of degree 0:
 `x y z nx ny nz f_dc_0..2 opacity scale_0..2 rot_0..3`, all float32, opacity as logit, scale as
-natural logarithm, rot wxyz. Viewers that read by name ignore what follows them.
+natural logarithm, rot wxyz. What follows them is ours; docs/files.md says which programs pass
+over it, and which need a file without (`state=False`).
 """
 
 from __future__ import annotations
 
-import os
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,13 @@ from numpy.typing import NDArray
 
 from bdgs_ros.core.config import BeliefConfig
 from bdgs_ros.core.errors import MapError
+from bdgs_ros.core.files import write_bytes
 from bdgs_ros.mapping.gaussians import GaussianMap, NewGaussians
+
+Array = NDArray[np.float32]
+Block = tuple[tuple[str, ...], Array]
+
+_LOGGER = logging.getLogger(__name__)
 
 SH_C0 = 0.28209479177387814
 STANDARD = (
@@ -24,11 +31,27 @@ STANDARD = (
     *('scale_0', 'scale_1', 'scale_2', 'rot_0', 'rot_1', 'rot_2', 'rot_3'),
 )
 STATE = ('p_dynamic', 'p_dynamic_smoothed', 'keyframe_index', 'observations')
+_OPTIONAL = ('nx', 'ny', 'nz')
+_TYPES = {
+    **{'float': '<f4', 'float32': '<f4', 'double': '<f8', 'float64': '<f8'},
+    **{'char': 'i1', 'int8': 'i1', 'uchar': 'u1', 'uint8': 'u1'},
+    **{'short': '<i2', 'int16': '<i2', 'ushort': '<u2', 'uint16': '<u2'},
+    **{'int': '<i4', 'int32': '<i4', 'uint': '<u4', 'uint32': '<u4'},
+}
 
 
-def save_ply(path: Path, gaussians: GaussianMap) -> None:
+def save_ply(path: Path, gaussians: GaussianMap, *, state: bool = True) -> None:
     """
     Write the map; aside first, then renamed, so an old file stays whole if this fails.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file.
+    gaussians : GaussianMap
+        The map.
+    state : bool
+        False leaves the standard properties alone, for programs that stumble over more.
 
     Raises
     ------
@@ -36,37 +59,60 @@ def save_ply(path: Path, gaussians: GaussianMap) -> None:
         If the file cannot be written.
 
     """
-    data = _to_table(gaussians).astype('<f4').tobytes()
-    properties = ''.join(f'property float {name}\n' for name in STANDARD + STATE)
-    header = (
-        'ply\nformat binary_little_endian 1.0\n'
-        f'element vertex {len(gaussians)}\n{properties}end_header\n'
-    )
-    aside = path.with_name(path.name + '.part')
+    blocks = _standard_blocks(gaussians) + (_state_blocks(gaussians) if state else [])
+    names = [name for block_names, _ in blocks for name in block_names]
+    columns = [array.reshape(len(gaussians), -1) for _, array in blocks]
+    table = np.concatenate(columns, axis=1, dtype=np.float32)
+    header = _header(len(gaussians), [f'float {name}' for name in names])
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        aside.write_bytes(header.encode('ascii') + data)
-        os.replace(aside, path)  # noqa: PTH105 - atomic on one file system
+        write_bytes(path, header, table.astype('<f4').tobytes())
     except OSError as error:
-        aside.unlink(missing_ok=True)
-        raise MapError(f"map not saved to '{path}': {error.strerror}") from error
+        raise MapError(f"map not saved to '{path}': {error.strerror or error}") from error
 
 
-def _to_table(gaussians: GaussianMap) -> NDArray[np.float32]:
+def _header(count: int, properties: list[str]) -> bytes:
+    lines = [f'property {text}\n' for text in properties]
+    start = f'ply\nformat binary_little_endian 1.0\nelement vertex {count}\n'
+    return (start + ''.join(lines) + 'end_header\n').encode('ascii')
+
+
+def _standard_blocks(gaussians: GaussianMap) -> list[Block]:
+    """Return the standard properties in their order; `f_rest_*` would follow `f_dc_*`."""
     quats = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
-    columns = [
-        gaussians.means,
-        np.zeros_like(gaussians.means),
-        (gaussians.colors - 0.5) / SH_C0,
-        gaussians.logit_opacities[:, None],
-        gaussians.log_scales,
-        quats,
-        gaussians.belief.belief[:, None],
-        gaussians.belief.smoothed[:, None],
-        gaussians.keyframe_index[:, None],
-        gaussians.observations[:, None],
+    return [
+        (('x', 'y', 'z'), gaussians.means),
+        (('nx', 'ny', 'nz'), np.zeros_like(gaussians.means)),
+        (('f_dc_0', 'f_dc_1', 'f_dc_2'), (gaussians.colors - 0.5) / SH_C0),
+        (('opacity',), gaussians.logit_opacities),
+        (('scale_0', 'scale_1', 'scale_2'), gaussians.log_scales),
+        (('rot_0', 'rot_1', 'rot_2', 'rot_3'), quats),
     ]
-    return np.concatenate(columns, axis=1, dtype=np.float32)
+
+
+def _state_blocks(gaussians: GaussianMap) -> list[Block]:
+    """Return what the filter and the mapper know beyond the standard, one name each."""
+    arrays = (
+        gaussians.belief.belief,
+        gaussians.belief.smoothed,
+        gaussians.keyframe_index.astype(np.float32),
+        gaussians.observations.astype(np.float32),
+    )
+    return [((name,), array) for name, array in zip(STATE, arrays, strict=True)]
+
+
+def write_points(path: Path, gaussians: GaussianMap) -> None:
+    """Write the centres of the static map as a plain coloured point cloud; `OSError` if not."""
+    shown = gaussians.visible_mask()
+    layout = [(name, '<f4') for name in ('x', 'y', 'z')]
+    layout += [(name, 'u1') for name in ('red', 'green', 'blue')]
+    points = np.zeros(int(shown.sum()), layout)
+    colors = np.clip(gaussians.colors[shown] * 255 + 0.5, 0, 255)
+    for i, name in enumerate(('x', 'y', 'z')):
+        points[name] = gaussians.means[shown, i]
+    for i, name in enumerate(('red', 'green', 'blue')):
+        points[name] = colors[:, i]
+    kinds = ['float x', 'float y', 'float z', 'uchar red', 'uchar green', 'uchar blue']
+    write_bytes(path, _header(len(points), kinds), points.tobytes())
 
 
 def load_ply(path: Path, config: BeliefConfig) -> GaussianMap:
@@ -76,26 +122,34 @@ def load_ply(path: Path, config: BeliefConfig) -> GaussianMap:
     Raises
     ------
     MapError
-        If the file is missing, not a binary little-endian .ply of float properties, lacks one of
-        the standard properties, or is shorter than its header says.
+        If the file is missing, not a binary little-endian .ply of vertices, lacks one of the
+        standard properties, or is shorter than its header says.
 
     """
-    names, table = _read_table(path)
-    missing = [n for n in STANDARD if n not in names and n not in ('nx', 'ny', 'nz')]
+    column = _read_columns(path)
+    missing = [n for n in STANDARD if n not in column and n not in _OPTIONAL]
     if missing:
         raise MapError(f"'{path}' is no 3DGS map: it lacks the properties {', '.join(missing)}")
-    column = {name: table[:, i] for i, name in enumerate(names)}
-    return _from_columns(column, len(table), config)
+    return _from_columns(_without_broken(path, column), config)
 
 
-def _from_columns(
-    column: dict[str, NDArray[np.float32]], count: int, config: BeliefConfig
-) -> GaussianMap:
-    def block(*names: str) -> NDArray[np.float32]:
+def _without_broken(path: Path, column: dict[str, Array]) -> dict[str, Array]:
+    """Leave out Gaussians with numbers that are not finite, which some trainers produce."""
+    needed = [name for name in (*STANDARD, *STATE) if name in column and name not in _OPTIONAL]
+    sound = np.all([np.isfinite(column[name]) for name in needed], axis=0)
+    sound &= np.any([column[f'rot_{i}'] != 0 for i in range(4)], axis=0)
+    if sound.all():
+        return column
+    _LOGGER.warning("'%s': %d Gaussians are not finite; left out", path, (~sound).sum())
+    return {name: values[sound] for name, values in column.items()}
+
+
+def _from_columns(column: dict[str, Array], config: BeliefConfig) -> GaussianMap:
+    def block(*names: str) -> Array:
         return np.ascontiguousarray(np.stack([column[n] for n in names], axis=1))
 
-    static = np.full(count, 0.1, np.float32)
-    belief = column.get('p_dynamic', static)
+    count = len(column['x'])
+    belief = column.get('p_dynamic', np.full(count, 0.1, np.float32))
     gaussians = GaussianMap(config)
     colors = block('f_dc_0', 'f_dc_1', 'f_dc_2') * np.float32(SH_C0) + np.float32(0.5)
     ones = np.ones(count, np.float32)
@@ -110,7 +164,8 @@ def _from_columns(
     return gaussians
 
 
-def _read_table(path: Path) -> tuple[list[str], NDArray[np.float32]]:
+def _read_columns(path: Path) -> dict[str, Array]:
+    """Return every property of the vertices as float32, [N] each."""
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -119,15 +174,31 @@ def _read_table(path: Path) -> tuple[list[str], NDArray[np.float32]]:
     lines = head.decode('ascii', errors='replace').split('\n')
     if not mark or lines[0] != 'ply' or 'format binary_little_endian 1.0' not in lines:
         raise MapError(f"'{path}' is not a binary little-endian .ply file")
-    count = next((int(w[2]) for w in map(str.split, lines) if w[:2] == ['element', 'vertex']), 0)
-    properties = [line.split() for line in lines if line.startswith('property')]
-    if any(len(p) != 3 or p[1] not in ('float', 'float32') for p in properties):
-        raise MapError(f"'{path}': every property of a 3DGS map is a float; these are not")
-    expected = 4 * count * len(properties)
+    count, layout = _layout(path, [line.split() for line in lines])
+    expected = count * layout.itemsize
     if len(body) < expected:
         raise MapError(
             f"'{path}' is truncated: {count} Gaussians need {expected} bytes, "
             f'{len(body)} are there'
         )
-    table = np.frombuffer(body[:expected], '<f4').reshape(count, len(properties))
-    return [p[2] for p in properties], table.astype(np.float32)
+    table = np.frombuffer(body, layout, count)
+    return {name: table[name].astype(np.float32) for name in layout.names or ()}
+
+
+def _layout(path: Path, lines: list[list[str]]) -> tuple[int, np.dtype[np.void]]:
+    """Return number and layout of the vertices, of which alone a 3DGS map consists."""
+    elements = [words[1:] for words in lines if words[:1] == ['element']]
+    if len(elements) != 1 or elements[0][0] != 'vertex' or not elements[0][-1].isdecimal():
+        found = ', '.join(' '.join(words) for words in elements) or 'none'
+        raise MapError(
+            f"'{path}': a 3DGS map has the one element 'vertex COUNT', this has: {found}; if it "
+            'is compressed, export it uncompressed'
+        )
+    properties = [words[1:] for words in lines if words[:1] == ['property']]
+    strange = [' '.join(p) for p in properties if len(p) != 2 or p[0] not in _TYPES]
+    strange += [' '.join(p) for p in properties if properties.count(p) > 1]
+    if strange:
+        raise MapError(
+            f"'{path}': a 3DGS map has numbers alone, each once; this has: {', '.join(strange)}"
+        )
+    return int(elements[0][1]), np.dtype([(name, _TYPES[kind]) for kind, name in properties])

@@ -1,0 +1,250 @@
+"""
+Keyframes as a folder, so that a map can be refined or continued after its run.
+
+The layout is a nerfstudio dataset, which other trainers read too: `transforms.json` with pose and
+intrinsics of every frame, and below it `images/` (8-bit RGB), `depth/` (16-bit, millimetres),
+`masks/` (8-bit, 0 = not to be used: something moved there). Poses are camera to world with the
+camera of OpenGL (x right, y up, z backward); (0, 0) is the corner of the top left pixel there, so
+`cx` and `cy` are half a pixel more than ours. What only we need has names of its own: `stamp_ns`,
+`keyframe_index`, `exposure` (log gain, offset) and `dynamic_file_path` (P(dynamic) x 255).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bdgs_ros.core.camera import PinholeCamera
+from bdgs_ros.core.errors import MapError
+from bdgs_ros.core.types import DepthImage, Pose
+from bdgs_ros.mapping.keyframes import MapKeyframe, build_levels
+
+TRANSFORMS = 'transforms.json'
+_FORMAT = 1
+_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+_PIXEL_CORNER = 0.5
+_MM_PER_M = 1000.0
+_MAX_MM = 65535
+_KINDS = {
+    'file_path': 'images',
+    'depth_file_path': 'depth',
+    'mask_path': 'masks',
+    'dynamic_file_path': 'dynamic',
+}
+
+
+@dataclass(frozen=True)
+class KeyframeSet:
+    """The keyframes that belong to a map."""
+
+    keyframes: Sequence[MapKeyframe] = ()
+    """Those whose images are kept."""
+    stamps_ns: Sequence[int] = ()
+    """Of all frames that the map was ever fitted to; others may be used to test it."""
+    next_index: int = 0
+
+
+def write_keyframes(folder: Path, kept: KeyframeSet, gaussians: int) -> None:
+    """
+    Write keyframes into an empty folder.
+
+    Parameters
+    ----------
+    folder : Path
+        Exists and is empty.
+    kept : KeyframeSet
+        What to write.
+    gaussians : int
+        Size of the map they belong to, by which a wrong pair is recognised.
+
+    Raises
+    ------
+    OSError
+        If something cannot be written.
+
+    """
+    for kind in _KINDS.values():
+        (folder / kind).mkdir()
+    frames = [_write_frame(folder, keyframe) for keyframe in kept.keyframes]
+    document = {
+        'camera_model': 'PINHOLE',
+        'depth_unit_scale_factor': 1 / _MM_PER_M,
+        'ply_file_path': 'points.ply',
+        'bdgs': {
+            'format': _FORMAT,
+            'gaussians': gaussians,
+            'next_index': kept.next_index,
+            'keyframe_stamps_ns': list(kept.stamps_ns),
+        },
+        'frames': frames,
+    }
+    (folder / TRANSFORMS).write_text(json.dumps(document, indent=1) + '\n', encoding='utf-8')
+
+
+def _write_frame(folder: Path, keyframe: MapKeyframe) -> dict[str, Any]:
+    finest = keyframe.levels[0]
+    images: dict[str, NDArray[Any]] = {
+        'file_path': _to_bytes(finest.color)[..., ::-1],
+        'depth_file_path': _to_millimetres(finest.depth_m),
+        'mask_path': np.where(finest.weight > 0, 255, 0).astype(np.uint8),
+        'dynamic_file_path': keyframe.p_dynamic,
+    }
+    paths = {key: f'{_KINDS[key]}/{keyframe.index:06d}.png' for key in images}
+    for key, image in images.items():
+        _write_png(folder / paths[key], image)
+    return {
+        **paths,
+        **_intrinsics(finest.camera),
+        'transform_matrix': (keyframe.T_world_camera @ _TO_OPENGL).tolist(),
+        'stamp_ns': int(keyframe.stamp_ns),
+        'keyframe_index': int(keyframe.index),
+        'exposure': [float(value) for value in keyframe.exposure],
+    }
+
+
+def _to_bytes(color: NDArray[np.float32]) -> NDArray[np.uint8]:
+    return np.asarray(np.clip(color * 255 + 0.5, 0, 255), np.uint8)
+
+
+def _to_millimetres(depth_m: DepthImage) -> NDArray[np.uint16]:
+    """Return depth in millimetres; what 16 bits cannot hold is invalid."""
+    millimetres = np.rint(np.nan_to_num(depth_m, posinf=0.0) * _MM_PER_M)
+    valid = (millimetres > 0) & (millimetres <= _MAX_MM)
+    return np.where(valid, millimetres, 0).astype(np.uint16)
+
+
+def _write_png(path: Path, image: NDArray[Any]) -> None:
+    written, data = cv2.imencode('.png', np.ascontiguousarray(image))
+    if not written:
+        raise OSError(f"'{path.name}': image of shape {image.shape} cannot be encoded")
+    path.write_bytes(data.tobytes())
+
+
+def _intrinsics(camera: PinholeCamera) -> dict[str, float]:
+    return {
+        'w': camera.width,
+        'h': camera.height,
+        'fl_x': camera.fx,
+        'fl_y': camera.fy,
+        'cx': camera.cx + _PIXEL_CORNER,
+        'cy': camera.cy + _PIXEL_CORNER,
+    }
+
+
+def gaussians_of(folder: Path) -> int | None:
+    """Return the size of the map that a folder of keyframes belongs to; None if any will do."""
+    count = _read_document(folder)['bdgs'].get('gaussians')
+    return None if count is None else int(count)
+
+
+def read_keyframes(folder: Path, levels: int) -> KeyframeSet:
+    """
+    Read what `write_keyframes` wrote.
+
+    Parameters
+    ----------
+    folder : Path
+        With `transforms.json`.
+    levels : int
+        Of the pyramid of Eq. 12 that is built for each keyframe.
+
+    Raises
+    ------
+    MapError
+        If the folder was not written by us, or a file of it is missing or does not fit.
+
+    """
+    document = _read_document(folder)
+    own = document['bdgs']
+    try:
+        keyframes = [_read_frame(folder, entry, levels) for entry in document['frames']]
+        stamps_ns = [int(stamp) for stamp in own['keyframe_stamps_ns']]
+        next_index = int(own['next_index'])
+    except (KeyError, TypeError, ValueError) as error:
+        raise MapError(
+            f"'{folder / TRANSFORMS}' is damaged: {type(error).__name__} {error}; "
+            f"remove '{folder}' to use the map without its keyframes"
+        ) from error
+    newest = max((keyframe.index for keyframe in keyframes), default=-1)
+    return KeyframeSet(keyframes, stamps_ns, max(next_index, newest + 1))
+
+
+def _read_document(folder: Path) -> dict[str, Any]:
+    path = folder / TRANSFORMS
+    advice = f"remove '{folder}' to use the map without its keyframes"
+    try:
+        document = json.loads(path.read_text(encoding='utf-8'))
+    except OSError as error:
+        raise MapError(f"'{path}' cannot be read: {error.strerror}; {advice}") from error
+    except ValueError as error:
+        raise MapError(f"'{path}' is not JSON: {error}; {advice}") from error
+    own = document.get('bdgs') if isinstance(document, dict) else None
+    if not isinstance(own, dict) or own.get('format') != _FORMAT:
+        raise MapError(
+            f"'{path}' has no entry 'bdgs' of format {_FORMAT}: it is a dataset of another "
+            f'program or version; {advice}'
+        )
+    return dict(document)
+
+
+def _read_frame(folder: Path, entry: Mapping[str, Any], levels: int) -> MapKeyframe:
+    camera = PinholeCamera(
+        int(entry['w']),
+        int(entry['h']),
+        float(entry['fl_x']),
+        float(entry['fl_y']),
+        float(entry['cx']) - _PIXEL_CORNER,
+        float(entry['cy']) - _PIXEL_CORNER,
+    )
+    read = _reader(folder, camera.shape)
+    color = np.ascontiguousarray(read(entry['file_path'], np.uint8, 3)[..., ::-1])
+    depth = read(entry['depth_file_path'], np.uint16, 1)
+    usable = read(entry['mask_path'], np.uint8, 1) > 0
+    depth_m = depth.astype(np.float32) / np.float32(_MM_PER_M)
+    exposure = np.array(entry['exposure'], np.float32).reshape(2)
+    return MapKeyframe(
+        int(entry['keyframe_index']),
+        int(entry['stamp_ns']),
+        _pose(entry['transform_matrix']),
+        read(entry['dynamic_file_path'], np.uint8, 1),
+        build_levels(color, depth_m, ~usable, camera, levels),
+        exposure,
+    )
+
+
+def _pose(rows: Any) -> Pose:
+    T_world_camera = np.array(rows, np.float64).reshape(4, 4) @ _TO_OPENGL
+    rotation = T_world_camera[:3, :3]
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4):
+        raise ValueError(f'transform_matrix {rows} is no rigid motion')
+    return T_world_camera
+
+
+def _reader(folder: Path, shape: tuple[int, int]) -> Callable[..., NDArray[Any]]:
+    def read(name: str, dtype: type, channels: int) -> NDArray[Any]:
+        path = folder / name
+        try:
+            data = np.frombuffer(path.read_bytes(), np.uint8)
+        except OSError as error:
+            raise MapError(
+                f"keyframe image '{path}' cannot be read: {error.strerror}; "
+                f"remove '{folder}' to use the map without its keyframes"
+            ) from error
+        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
+        expected = (*shape, channels) if channels > 1 else shape
+        if image is None or image.shape != expected or image.dtype != dtype:
+            found = 'no image' if image is None else f'{image.dtype} {image.shape}'
+            raise MapError(
+                f"keyframe image '{path}': expected {np.dtype(dtype)} {expected}, found {found}; "
+                f"remove '{folder}' to use the map without its keyframes"
+            )
+        return np.asarray(image)
+
+    return read
