@@ -74,7 +74,7 @@ def write_keyframes(folder: Path, kept: KeyframeSet, gaussians: int) -> None:
         (folder / kind).mkdir()
     frames = [_write_frame(folder, keyframe) for keyframe in kept.keyframes]
     document = {
-        'camera_model': 'PINHOLE',
+        'camera_model': 'OPENCV',  # of the names for a pinhole the one that all readers know
         'depth_unit_scale_factor': 1 / _MM_PER_M,
         'ply_file_path': 'points.ply',
         'bdgs': {

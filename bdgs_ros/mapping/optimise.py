@@ -61,6 +61,32 @@ class Optimiser:
         schedule = self._schedule(newest, others)
         return [self._step(gaussians, kf, level, visible, penalised) for kf, level in schedule]
 
+    def step(
+        self,
+        gaussians: GaussianMap,
+        keyframe: MapKeyframe,
+        level_index: int,
+        rate_scale: float = 1.0,
+    ) -> float:
+        """
+        Take one step of Eq. 7 on one view and return its loss.
+
+        Parameters
+        ----------
+        gaussians : GaussianMap
+            Changed in place.
+        keyframe : MapKeyframe
+            The view; its exposure is adapted too.
+        level_index : int
+            Of the keyframe's pyramid, 0 is the finest.
+        rate_scale : float
+            Factor on every learning rate.
+
+        """
+        visible = gaussians.visible_mask()
+        penalised = visible & (gaussians.states == State.DYNAMIC)
+        return self._step(gaussians, keyframe, level_index, visible, penalised, rate_scale)
+
     def _schedule(
         self, newest: MapKeyframe, others: Sequence[MapKeyframe]
     ) -> Iterator[tuple[MapKeyframe, int]]:
@@ -83,14 +109,15 @@ class Optimiser:
         level_index: int,
         visible: NDArray[np.bool_],
         penalised: NDArray[np.bool_],
+        rate_scale: float = 1.0,
     ) -> float:
         level = keyframe.levels[level_index]
         active = visible & self._opaque_enough(gaussians.logit_opacities, level_index)
         result = self._photometric(gaussians, keyframe, level, active)
         gradients = dict(zip(PARAMETERS, result.gradients.parameters(), strict=True))
         regulariser = self._add_direct_terms(gaussians, gradients, level, penalised)
-        self._adam(gaussians, gradients, (result.visibility > 0) | penalised)
-        self._adapt_exposure(keyframe, result.exposure_gradient)
+        self._adam(gaussians, gradients, (result.visibility > 0) | penalised, rate_scale)
+        self._adapt_exposure(keyframe, result.exposure_gradient, rate_scale)
         return result.loss + regulariser
 
     def _opaque_enough(self, logit_opacities: Array, level_index: int) -> NDArray[np.bool_]:
@@ -141,20 +168,25 @@ class Optimiser:
         return float(per_pixel) * (weights.dynamic * dynamic + weights.reg * large)
 
     def _adam(
-        self, gaussians: GaussianMap, gradients: dict[str, Array], touched: NDArray[np.bool_]
+        self,
+        gaussians: GaussianMap,
+        gradients: dict[str, Array],
+        touched: NDArray[np.bool_],
+        rate_scale: float,
     ) -> None:
         for name in PARAMETERS:
             adam_step(
                 gaussians.parameters[name],
                 gradients[name],
                 *gaussians.moments[name],
-                rate=self._rates[name],
+                rate=rate_scale * self._rates[name],
                 rows=touched,
             )
 
-    def _adapt_exposure(self, keyframe: MapKeyframe, gradient: Array) -> None:
+    def _adapt_exposure(self, keyframe: MapKeyframe, gradient: Array, rate_scale: float) -> None:
         """Fit gain and offset of a keyframe; the first keyframe defines the map's exposure."""
         if keyframe.index == 0:
             return
         moments = keyframe.exposure_moments
-        adam_step(keyframe.exposure, gradient, *moments, rate=self._config.rate.exposure)
+        rate = rate_scale * self._config.rate.exposure
+        adam_step(keyframe.exposure, gradient, *moments, rate=rate)
