@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ from bdgs_ros.eval.metric import Metric
 from bdgs_ros.eval.recorder import Sample
 
 _LOGGER = logging.getLogger(__name__)
+Perceptual = Callable[[NDArray[Any], NDArray[Any], NDArray[np.bool_] | None], float]
 _SEEN = 0.5  # silhouette above which the map says something about a pixel
 
 
@@ -139,7 +140,10 @@ def render_metrics(views: Sequence[View], truth: Truth | None = None) -> list[Me
 
 
 def score_view(
-    view: View, truth: Truth | None = None, static: NDArray[np.bool_] | None = None
+    view: View,
+    truth: Truth | None = None,
+    static: NDArray[np.bool_] | None = None,
+    perceptual: Perceptual | None = None,
 ) -> dict[str, float]:
     """
     Score one render; `render_metrics` is the mean of these.
@@ -152,6 +156,8 @@ def score_view(
         Its static view is what the render is compared with; without it, the frame itself.
     static : ndarray of bool, shape (H, W), optional
         Pixels that count where truth is not known; by default those not called dynamic.
+    perceptual : callable, optional
+        Distance of image and truth over valid pixels, for the score `lpips`.
 
     Returns
     -------
@@ -160,8 +166,10 @@ def score_view(
 
     """
     if truth is not None:
-        return _against_truth(view, truth)
-    return _against_input(view, view.sample.static if static is None else static)
+        return _against_truth(view, truth, perceptual)
+    counted = view.sample.static if static is None else static
+    frame: RgbdFrame = view.sample.frame
+    return _scores(view, frame.color, frame.depth_m, counted, perceptual)
 
 
 def mean_scores(scores: Sequence[Mapping[str, float]]) -> list[Metric]:
@@ -181,35 +189,38 @@ _UNITS = {
     'psnr_exposure_fit': 'dB',
     'psnr_hidden': 'dB',
     'ssim': '',
+    'lpips': '',
     'depth_l1': 'cm',
     'seen': '%',
 }
 
 
-def _against_truth(view: View, truth: Truth) -> dict[str, float]:
+def _against_truth(view: View, truth: Truth, perceptual: Perceptual | None) -> dict[str, float]:
     stamp_ns = view.sample.frame.stamp_ns
     hidden = np.asarray(truth.dynamic(stamp_ns), dtype=bool)
     color, depth = truth.static_color(stamp_ns), truth.static_depth(stamp_ns)
-    scores = _scores(view, color, depth, np.ones(hidden.shape, dtype=bool))
+    scores = _scores(view, color, depth, np.ones(hidden.shape, dtype=bool), perceptual)
     return {**scores, 'psnr_hidden': rendering.psnr(view.color, color, hidden)}
 
 
-def _against_input(view: View, static: NDArray[np.bool_]) -> dict[str, float]:
-    frame: RgbdFrame = view.sample.frame
-    return _scores(view, frame.color, frame.depth_m, static)
-
-
 def _scores(
-    view: View, color: ColorImage, depth: DepthImage, valid: NDArray[np.bool_]
+    view: View,
+    color: ColorImage,
+    depth: DepthImage,
+    valid: NDArray[np.bool_],
+    perceptual: Perceptual | None,
 ) -> dict[str, float]:
     fitted = rendering.fit_exposure(view.color, color, valid)
-    return {
+    scores = {
         'psnr': rendering.psnr(view.color, color, valid),
         'psnr_exposure_fit': rendering.psnr(fitted, color, valid),
         'ssim': rendering.ssim(view.color, color, valid),
         'depth_l1': 100.0 * rendering.depth_l1(view.depth_m, depth, valid),
         'seen': 100.0 * float(np.mean(view.silhouette > _SEEN)),
     }
+    if perceptual is not None:
+        scores['lpips'] = perceptual(view.color, color, valid)
+    return scores
 
 
 def _mean(values: Sequence[float]) -> float:
