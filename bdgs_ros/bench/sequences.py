@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from bdgs_ros.core.errors import DatasetError
+from bdgs_ros.bench.harness import Cell, Options
+from bdgs_ros.core.config import BdgsConfig, with_values
+from bdgs_ros.core.errors import DatasetError, ModelError
 
 SYNTH_FRAMES = 300
 SYNTH_FRAMES_QUICK = 60
+REAL_FRAMES_QUICK = 60
+WEIGHTS = Path('models') / 'yolov5n-320.onnx'
+_SYNTH = 'synth_'
 
 
 @dataclass(frozen=True)
@@ -68,3 +75,62 @@ def _record(path: Path, scenario: str, seed: int, frames: int) -> None:
         write_recording(
             path, scenario, seed, frames, progress=lambda done, total: bar.update(done - bar.n)
         )
+
+
+def real_settings(options: Options) -> dict[str, Any]:
+    """Return what a cell on a real recording is known by."""
+    return {'kind': 'real', 'frames': REAL_FRAMES_QUICK if options.quick else None}
+
+
+def synth_settings(options: Options) -> dict[str, Any]:
+    """Return what a cell on a synthetic recording is known by."""
+    return {'kind': 'synth', 'frames': SYNTH_FRAMES_QUICK if options.quick else SYNTH_FRAMES}
+
+
+def cell_recording(cell: Cell, options: Options) -> Path:
+    """Return the recording of a cell; its sequence is `synth_SCENARIO` or a real one's name."""
+    if cell.settings['kind'] == 'real':
+        return real_path(cell.sequence, options.data)
+    scenario = cell.sequence.removeprefix(_SYNTH)
+    return synth_path(scenario, cell.seed, cell.settings['frames'], options.work.parent)
+
+
+def synth_name(scenario: str) -> str:
+    """Return the sequence name of a scenario."""
+    return f'{_SYNTH}{scenario}'
+
+
+def frame_limit(cell: Cell) -> int | None:
+    """Return how many frames of the recording the cell uses; None for all."""
+    limit: int | None = cell.settings['frames'] if cell.settings['kind'] == 'real' else None
+    return limit
+
+
+def weights_path(options: Options) -> Path:
+    """Return where the detector's weights are looked for."""
+    return options.weights or options.data / WEIGHTS
+
+
+def detector_settings(configuration: str, options: Options) -> Mapping[str, Any]:
+    """Return the parameters of a cell and the name of its weights file."""
+    weights = weights_path(options).name if configuration == 'weights' else ''
+    return {'values': dict(options.values), 'weights': weights}
+
+
+def cell_config(cell: Cell, options: Options) -> BdgsConfig:
+    """
+    Return the configuration of a cell: `weights` has the detector, any other has not.
+
+    Raises
+    ------
+    ModelError
+        If there are no weights.
+
+    """
+    values = dict(options.values)
+    if cell.configuration == 'weights':
+        path = weights_path(options)
+        if not path.is_file():
+            raise ModelError(f"no weights at '{path}'; give them with --weights")
+        values['detection.weights'] = str(path)
+    return with_values(BdgsConfig(), values)

@@ -3,21 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from bdgs_ros.bench import sequences
 from bdgs_ros.bench.harness import Cell, Options
-from bdgs_ros.bench.sequences import (
-    REAL,
-    SYNTH_FRAMES,
-    SYNTH_FRAMES_QUICK,
-    real_path,
-    synth_path,
-)
-from bdgs_ros.core.config import BdgsConfig, with_values
-from bdgs_ros.core.errors import ModelError
+from bdgs_ros.bench.sequences import REAL
 
 NAME = 'slam'
 PROTOCOL = """
@@ -30,9 +22,7 @@ static world, all pixels; real: against the input, pixels called dynamic left ou
 only the pixels that something moving covered. ms: medians, `mapping` per keyframe.
 """
 
-WEIGHTS = Path('models') / 'yolov5n-320.onnx'
 _QUICK_SCENARIOS = ('static', 'walking_static')
-_QUICK_FRAMES = 60
 
 _COLUMNS = {
     'frames': 'frames_in',
@@ -55,28 +45,21 @@ _COLUMNS = {
 }
 
 
-def weights_path(options: Options) -> Path:
-    """Return where the detector's weights are looked for."""
-    return options.weights or options.data / WEIGHTS
-
-
 def cells(options: Options) -> list[Cell]:
     """List real and synthetic recordings, each with weights and with the geometric prior alone."""
     from bdgs_ros.data.synth import scenarios
 
     names = _QUICK_SCENARIOS if options.quick else tuple(scenarios())
-    real_frames = _QUICK_FRAMES if options.quick else None
-    synth_frames = SYNTH_FRAMES_QUICK if options.quick else SYNTH_FRAMES
     found = []
     for configuration in ('weights', 'geometric'):
-        weights = weights_path(options).name if configuration == 'weights' else ''
-        common = {'values': dict(options.values), 'weights': weights}
+        common = sequences.detector_settings(configuration, options)
         for sequence in REAL:
-            settings = {'kind': 'real', 'frames': real_frames, **common}
+            settings = {**sequences.real_settings(options), **common}
             found.append(Cell(sequence.name, configuration, 0, settings))
+        settings = {**sequences.synth_settings(options), **common}
         for name in names:
-            settings = {'kind': 'synth', 'frames': synth_frames, **common}
-            found += [Cell(f'synth_{name}', configuration, s, settings) for s in options.seeds]
+            sequence_name = sequences.synth_name(name)
+            found += [Cell(sequence_name, configuration, s, settings) for s in options.seeds]
     return sorted(found, key=lambda cell: (cell.settings['kind'], cell.sequence, cell.seed))
 
 
@@ -84,28 +67,12 @@ def run_cell(cell: Cell, options: Options) -> dict[str, Any]:
     """Run one recording with one configuration; its result files stay in the work folder."""
     from bdgs_ros.job import Job, run_job
 
-    synthetic = cell.settings['kind'] == 'synth'
-    frames = cell.settings['frames']
-    config = _config(cell, options)
-    if synthetic:
-        scenario = cell.sequence.removeprefix('synth_')
-        recording = synth_path(scenario, cell.seed, frames, options.work.parent)
-    else:
-        recording = real_path(cell.sequence, options.data)
+    config = sequences.cell_config(cell, options)
+    recording = sequences.cell_recording(cell, options)
     output = options.work / 'runs' / cell.key
-    limit = None if synthetic else frames
+    limit = sequences.frame_limit(cell)
     metrics = run_job(Job(recording, output, config, frames=limit))['metrics']
     return {column: metrics[name]['value'] for column, name in _COLUMNS.items() if name in metrics}
-
-
-def _config(cell: Cell, options: Options) -> BdgsConfig:
-    values = dict(options.values)
-    if cell.configuration == 'weights':
-        path = weights_path(options)
-        if not path.is_file():
-            raise ModelError(f"no weights at '{path}'; give them with --weights")
-        values['detection.weights'] = str(path)
-    return with_values(BdgsConfig(), values)
 
 
 def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

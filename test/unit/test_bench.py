@@ -132,14 +132,14 @@ def test_slam_summary_picks_and_pools():
 
 
 def test_missing_recordings_and_weights_are_named(tmp_path):
-    from bdgs_ros.bench import sequences, slam
+    from bdgs_ros.bench import sequences
     from bdgs_ros.core.errors import ModelError
 
     with pytest.raises(DatasetError, match='BDGS_SHARED'):
         sequences.real_path('fr1_rpy_part', tmp_path)
     cell = SimpleNamespace(configuration='weights')
     with pytest.raises(ModelError, match=r'yolov5n-320\.onnx.*--weights'):
-        slam._config(cell, Options(tmp_path, tmp_path))
+        sequences.cell_config(cell, Options(tmp_path, tmp_path))
 
 
 def test_rasterizer_scene_fills_the_view():
