@@ -22,7 +22,7 @@
 //             touch. Per block: walk its list with T, colour, depth ... in registers. Alphas are
 //             kept for the way back, but only for pairs in which some pixel was touched. A block
 //             whose pixels are all opaque stops.
-//   loss      L1, masked SSIM, depth, exposure: gradient planes (rasterizer_loss.hpp).
+//   loss      L1, masked SSIM, depth, smoothness, exposure: gradient planes (rasterizer_loss.hpp).
 //   backward  per block, front to back again with the kept alphas. With u_i = dL/dw_i (colour,
 //             depth and silhouette gradients of the pixel dotted with the Gaussian's) and R_i =
 //             sum_{j > i} w_j u_j, which is the pixel's total minus what has been walked:
@@ -800,7 +800,7 @@ py::tuple fused_step(Rasterizer& r, const py::tuple& gaussians, const py::object
                      int height, const std::array<double, 4>& intrinsics,
                      const std::array<double, 16>& pose, int threads, const Floats& target_color,
                      const Floats& target_depth, const Floats& pixel_weight,
-                     const std::array<float, 3>& weights, const std::array<float, 2>& exposure,
+                     const std::array<float, 4>& weights, const std::array<float, 2>& exposure,
                      const py::tuple& gradients, const py::object& images) {
   const Parameters in = parameters_of(gaussians, active);
   const View view = view_of(width, height, intrinsics, pose);
@@ -808,7 +808,7 @@ py::tuple fused_step(Rasterizer& r, const py::tuple& gaussians, const py::object
   const GradientArrays out = gradients_of(gradients, d_pose);
   const LossInput loss_in{target_color.data(), target_depth.data(), pixel_weight.data(),
                           weights[0],          weights[1],          weights[2],
-                          exposure[0],         exposure[1]};
+                          weights[3],          exposure[0],         exposure[1]};
   LossResult loss;
   {
     py::gil_scoped_release release;
@@ -817,8 +817,8 @@ py::tuple fused_step(Rasterizer& r, const py::tuple& gaussians, const py::object
     r.backward(in, view, threads, out);
   }
   if (!images.is_none()) copy_rendered(r, images, threads);
-  return py::make_tuple(loss.total, loss.l1, loss.ssim, loss.depth, loss.d_log_gain, loss.d_offset,
-                        d_pose);
+  return py::make_tuple(loss.total, loss.l1, loss.ssim, loss.depth, loss.smooth, loss.d_log_gain,
+                        loss.d_offset, d_pose);
 }
 
 // Whether this processor (and its kernel) can run the build `name`.

@@ -3,11 +3,20 @@
 //   I   = exp(log_gain) C + offset                        exposure of the target, C rendered
 //   E   = sum_p w_p [ l1 |I - T|_p + ssim (1 - SSIM_p) ] / sum_p w_p
 //       + depth  sum_{p: D_p > 0} w_p |Z - S D|_p / sum_{p: D_p > 0} w_p
+//       + smooth sum_p w_p (e_p^h r_p^h + e_p^v r_p^v) / sum_p w_p
 //
 // |.| and SSIM are means over the three channels. Z = sum of weights times depth and S = silhouette,
 // so Z - S D = sum of weights times (z - D): it needs no division by S, is zero where nothing was
 // drawn, and pulls each Gaussian by its own weight. (Z / S - D instead grows without bound at the
 // rim of the map, where S goes to 0.)
+//
+// The last term is the edge-aware smoothness that stands for the image-gradient term of Eq. 8, after
+// `depth_reg` of MonoGS (Matsuki et al., 2024): there e |dZ| with e = exp(-10 |grad T|^2). A first
+// difference would turn every wall towards the camera, so here r compares a pixel's mean depth z = Z/S
+// with that of the line through its two neighbours, along the row (h) and the column (v):
+//   r = |z - 2 z_- z_+ / (z_- + z_+)|      0 on any plane, because 1/z is affine in the image
+//   e = exp(-10 (|T - T_-|^2 + |T - T_+|^2)) with means over the channels
+// and counts only if all three pixels have w > 0 and S > 0.5: a hole is not a cliff.
 //
 // SSIM uses the usual 11 x 11 window, sigma 1.5 px, and constants for images in [0, 1]. The window
 // is cut to the pixels with w > 0 inside the image and normalised over them, so what a moving
@@ -42,6 +51,7 @@ enum Plane {
   kRed, kGreen, kBlue, kDepth, kSilhouette, kDynamic,  // rendered
   kGradRed, kGradGreen, kGradBlue, kGradDepth, kGradSilhouette,
   kWeight, kMask,           // w and w > 0
+  kMean, kBendH, kBendV,    // z where it counts, else 0; dL/dz by the middle pixel of r^h and r^v
   kX, kY = kX + 3, kS = kY + 3, kC = kS + 3,
   kField = kC + 3,          // f_m/n, f_s/n, f_c/n of three channels
   kPlanes = kField + 9
@@ -49,11 +59,11 @@ enum Plane {
 
 struct LossInput {
   const float *color, *depth, *weight;  // target: [H, W, 3], [H, W], [H, W]
-  float l1, ssim, depth_weight, log_gain, offset;
+  float l1, ssim, depth_weight, smooth, log_gain, offset;
 };
 
 struct LossResult {
-  double total = 0, l1 = 0, ssim = 0, depth = 0, d_log_gain = 0, d_offset = 0;
+  double total = 0, l1 = 0, ssim = 0, depth = 0, smooth = 0, d_log_gain = 0, d_offset = 0;
 };
 
 class Loss {
@@ -80,6 +90,12 @@ class Loss {
 #pragma omp for schedule(static)
         for (int y = 0; y < height; ++y) ssim_row(y);
       }
+      if (in_.smooth > 0) {
+#pragma omp for schedule(static)
+        for (int y = 0; y < height; ++y) bend_row(y);
+#pragma omp for schedule(static)
+        for (int y = 0; y < height; ++y) smooth_row(y);
+      }
 #pragma omp for schedule(static)
       for (int y = 0; y < height; ++y) finish_row(y);
     }
@@ -89,10 +105,11 @@ class Loss {
  private:
   static constexpr int kRadius = 5;
   static constexpr float kFar = 1e30f;  // infinite depth is no depth
+  static constexpr float kEdge = 10.0f;
   static constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;
 
   struct Row {
-    double weight, depth_weight, l1, ssim, depth, d_log_gain, d_offset;
+    double weight, depth_weight, l1, ssim, depth, smooth, d_log_gain, d_offset;
   };
 
   float* plane(int which, int y) { return planes_ + which * layout_.plane + layout_.at(y, 0); }
@@ -188,7 +205,64 @@ class Loss {
     const Lanes by_depth = (in_.depth_weight * per_depth_) * use * sign(error);
     store(plane(kGradDepth, y) + x, by_depth);
     store(plane(kGradSilhouette, y) + x, -by_depth * d);
+    if (in_.smooth > 0) {
+      const Lanes silhouette = load(plane(kSilhouette, y) + x);
+      const Mask counts = (silhouette > 0.5f) & (w > 0.0f);
+      const Lanes z = load(plane(kDepth, y) + x) / max(silhouette, splat(0.5f));
+      store(plane(kMean, y) + x, counts ? max(z, zero) : zero);
+    }
     return use * abs(error);
+  }
+
+  // w e r of the triple around (x, y) along `step`, and its derivative by the middle depth.
+  Lanes bend(int y, int x, ptrdiff_t step, Lanes* slope) {
+    const float* z = plane(kMean, y) + x;
+    const Lanes before = load(z - step), middle = load(z), after = load(z + step);
+    const Mask counts = (before > 0.0f) & (middle > 0.0f) & (after > 0.0f);
+    Lanes edge = Lanes{};
+    for (int c = 0; c < 3; ++c) {
+      const float* t = plane(kY + c, y) + x;
+      const Lanes one = load(t) - load(t - step), other = load(t) - load(t + step);
+      edge += one * one + other * other;
+    }
+    const Lanes e = exp2(max(edge * (-kEdge / 3.0f * kLog2E), splat(-100.0f)));
+    const Lanes weight = counts ? e * load(plane(kWeight, y) + x) : Lanes{};
+    const Lanes r = middle - 2.0f * before * after / max(before + after, splat(1e-6f));
+    *slope = (in_.smooth * per_weight_) * weight * sign(r);
+    return weight * abs(r);
+  }
+
+  void bend_row(int y) {
+    Lanes loss = Lanes{}, slope;
+    for (int x = 0; x < layout_.width; x += kLanes) {
+      loss += bend(y, x, 1, &slope);
+      store(plane(kBendH, y) + x, slope);
+      loss += bend(y, x, static_cast<ptrdiff_t>(layout_.stride), &slope);
+      store(plane(kBendV, y) + x, slope);
+    }
+    rows_[y].smooth = sum(loss);
+  }
+
+  // dL/dz at (x, y) from the three triples along `step` that it is part of.
+  static Lanes bend_backward(const float* z, const float* slope, ptrdiff_t step) {
+    const Lanes middle = load(z), before = load(z - 2 * step), after = load(z + 2 * step);
+    const Lanes of_after = after / max(middle + after, splat(1e-6f));
+    const Lanes of_before = before / max(middle + before, splat(1e-6f));
+    return load(slope) - 2.0f * (load(slope + step) * of_after * of_after +
+                                 load(slope - step) * of_before * of_before);
+  }
+
+  void smooth_row(int y) {
+    const ptrdiff_t down = static_cast<ptrdiff_t>(layout_.stride);
+    const float* z = plane(kMean, y);
+    for (int x = 0; x < layout_.width; x += kLanes) {
+      const Lanes d_mean = bend_backward(z + x, plane(kBendH, y) + x, 1) +
+                           bend_backward(z + x, plane(kBendV, y) + x, down);
+      const Lanes by_depth = d_mean / max(load(plane(kSilhouette, y) + x), splat(0.5f));
+      float *depth = plane(kGradDepth, y) + x, *silhouette = plane(kGradSilhouette, y) + x;
+      store(depth, load(depth) + by_depth);
+      store(silhouette, load(silhouette) - by_depth * load(z + x));
+    }
   }
 
   // Vertical half of the window for row y; `out` also covers the border that the other half needs.
@@ -276,10 +350,12 @@ class Loss {
       out.l1 += rows_[y].l1 * per_weight_;
       out.ssim += rows_[y].ssim * per_weight_;
       out.depth += rows_[y].depth * per_depth_;
+      out.smooth += rows_[y].smooth * per_weight_;
       out.d_log_gain += rows_[y].d_log_gain;
       out.d_offset += rows_[y].d_offset;
     }
-    out.total = in_.l1 * out.l1 + in_.ssim * out.ssim + in_.depth_weight * out.depth;
+    out.total = in_.l1 * out.l1 + in_.ssim * out.ssim + in_.depth_weight * out.depth +
+                in_.smooth * out.smooth;
     return out;
   }
 

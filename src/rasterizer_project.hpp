@@ -23,7 +23,6 @@ namespace bdgs {
 constexpr float kNear = 0.05f;             // m: Gaussians closer to the camera are not drawn
 constexpr float kLowPass = 0.3f;           // px^2
 constexpr float kMinAlpha = 1.0f / 255.0f; // fainter contributions are skipped
-constexpr float kLog2E = 1.4426950408889634f;
 constexpr float kLn2 = 0.6931471805599453f;
 
 struct View {

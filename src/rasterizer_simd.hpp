@@ -28,6 +28,8 @@ typedef float Lanes __attribute__((vector_size(32)));
 typedef int32_t Mask __attribute__((vector_size(32)));
 #endif
 
+constexpr float kLog2E = 1.4426950408889634f;
+
 inline Lanes splat(float value) { return value - Lanes{}; }
 
 inline Lanes load(const float* from) {

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 from functools import lru_cache
+from importlib.util import find_spec
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,33 +51,67 @@ _LOGGER = logging.getLogger(__name__)
 @lru_cache(maxsize=1)
 def available_backends() -> tuple[str, ...]:
     """Return the names of the backends that run here, fastest first; 'torch' is always there."""
-    return (*(v for v in VARIANTS if load_module(v) is not None), 'torch')
+    natives = tuple(v for v in VARIANTS if load_module(v) is not None)
+    if find_spec('gsplat') is None:  # asked first: torch takes seconds to import
+        return (*natives, 'torch')
+    from bdgs_ros.mapping.rasterize_gsplat import obstacle
+
+    reason = obstacle()
+    if reason is not None:
+        _LOGGER.info('gsplat is installed but cannot be used: %s', reason)
+    return (*(() if reason else ('gsplat',)), *natives, 'torch')
 
 
 @lru_cache(maxsize=16)
 def _backend(name: str) -> Backend:
-    """Resolve 'auto', 'native', a build's name or 'torch'."""
+    """Resolve 'auto', 'native', or one of `available_backends()`."""
     available = available_backends()
-    natives = [v for v in available if v != 'torch']
-    if name in ('auto', 'native') and natives:
+    if name == 'auto':
+        return _fastest(available)
+    natives = [v for v in available if v in VARIANTS]
+    if name == 'native' and natives:
         name = natives[0]
-    elif name == 'auto':
-        _LOGGER.warning(
-            'no compiled rasteriser: using its torch twin, about 100 times slower; '
-            'install a C++17 compiler with OpenMP and reinstall bdgs_ros'
-        )
-        name = 'torch'
     if name not in available:
         raise MapError(
             f'rasteriser backend {name!r} cannot run here; available: {", ".join(available)}'
         )
-    if name != 'torch':
-        module = load_module(name)
-        assert module is not None
-        return NativeBackend(module)
-    from bdgs_ros.mapping.rasterize_torch import TorchBackend  # torch takes seconds to import
+    return _open(name)
 
-    return TorchBackend()
+
+def _fastest(available: tuple[str, ...]) -> Backend:
+    """Return the fastest backend that starts, and log which."""
+    if available[0] == 'gsplat':
+        try:
+            backend = _open('gsplat')
+        except MapError as error:
+            _LOGGER.warning('%s; the rasteriser runs on the CPU instead', error)
+            available = available[1:]
+        else:
+            _LOGGER.info('rasteriser: gsplat, for there is a CUDA device')
+            return backend
+    if available[0] == 'torch':
+        _LOGGER.warning(
+            'no compiled rasteriser: using its torch twin, about 100 times slower; '
+            'install a C++17 compiler with OpenMP and reinstall bdgs_ros'
+        )
+    else:
+        _LOGGER.info('rasteriser: native, the fastest of %s', ', '.join(available))
+    return _open(available[0])
+
+
+def _open(name: str) -> Backend:
+    """Start one of `available_backends()`; torch, which takes seconds to import, only if used."""
+    if name == 'gsplat':
+        from bdgs_ros.mapping.rasterize_gsplat import GsplatBackend
+
+        return GsplatBackend()
+    if name == 'torch':
+        from bdgs_ros.mapping.rasterize_torch import TorchBackend
+
+        return TorchBackend()
+    module = load_module(name)
+    assert module is not None
+    return NativeBackend(module)
 
 
 def render(
@@ -191,7 +226,9 @@ def fused_step(
     The colour term is Eq. 9 between `exp(log_gain) * color + offset` and the target. SSIM windows
     are cut to the pixels with weight > 0 and normalised over them. The depth term is
     |depth - silhouette * D|, which needs no division: depth / silhouette - D would grow without
-    bound where the silhouette goes to 0. Both are means weighted by `pixel_weight`.
+    bound where the silhouette goes to 0. Both are means weighted by `pixel_weight`, and so is the
+    smoothness term, the first of Eq. 8: how far depth / silhouette is from locally plane, off the
+    target's edges.
 
     Parameters
     ----------

@@ -69,8 +69,13 @@ class NativeBackend:
         """Render, compare and differentiate."""
         arrays = _empty_gradients(len(scene.gaussians))
         images = _empty_images(scene) if with_images else None
-        terms = (weights.color * (1 - weights.ssim), weights.color * weights.ssim, weights.depth)
-        loss, l1, ssim, depth, d_log_gain, d_offset, pose = self.workspace.fused_step(
+        terms = (
+            weights.color * (1 - weights.ssim),
+            weights.color * weights.ssim,
+            weights.depth,
+            weights.smooth,
+        )
+        loss, l1, ssim, depth, smooth, d_log_gain, d_offset, pose = self.workspace.fused_step(
             *_arguments(scene),
             target.color,
             target.depth,
@@ -89,6 +94,7 @@ class NativeBackend:
             np.array([d_log_gain, d_offset], np.float32),
             arrays[5],
             Rendered(*images) if images else None,
+            smooth,
         )
 
     def adam_step(

@@ -8,6 +8,7 @@ after the other and differentiated one after the other, so memory stays bounded.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -33,6 +34,8 @@ MIN_TRANSMITTANCE = 1e-4
 CLAMP_MARGIN = 0.15  # of the image size on each side: 1.3 times the field of view
 SSIM_RADIUS, SSIM_SIGMA = 5, 1.5
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
+EDGE_DECAY = 10.0  # as in MonoGS
+MIN_SILHOUETTE = 0.5  # less than half covered has no surface to be smooth
 
 _TILE = 16
 _COLOR, _DEPTH, _SILHOUETTE, _DYNAMIC = slice(0, 3), 3, 4, 5
@@ -211,27 +214,80 @@ def masked_ssim(x: Tensor, y: Tensor, mask: Tensor) -> Tensor:
     return upper / ((mx**2 + my**2 + SSIM_C1) * (variances + SSIM_C2))
 
 
+def smoothness(images: Tensor, wanted: Tensor, share: Tensor) -> Tensor:
+    """
+    Return how far the rendered depth is from locally plane, off the edges of the target.
+
+    The first term of Eq. 8 in the edge-aware form of `depth_reg` in MonoGS, Matsuki et al.,
+    "Gaussian Splatting SLAM", 2024: exp(-10 |grad T|^2) |grad z|. A first difference would turn
+    walls towards the camera; here a pixel's depth is compared with that of the line through its
+    two neighbours, 2 z_- z_+ / (z_- + z_+), which is exact on any plane.
+
+    Parameters
+    ----------
+    images : Tensor, shape (H, W, 6)
+        As rendered. Pixels count where the silhouette is above one half.
+    wanted : Tensor, shape (H, W, 3)
+        RGB of the target.
+    share : Tensor, shape (H, W)
+        Weight of each pixel; triples with a 0 do not count.
+
+    """
+    silhouette = images[..., _SILHOUETTE]
+    counts = (silhouette > MIN_SILHOUETTE) & (share > 0)
+    z = torch.where(counts, images[..., _DEPTH] / silhouette.clamp_min(MIN_SILHOUETTE), 0.0)
+    total = torch.zeros((), dtype=images.dtype)
+    for axis in (0, 1):
+        length = images.shape[axis]
+        if length < 3:
+            continue
+
+        def triple(image: Tensor, axis: int = axis, length: int = length) -> tuple[Tensor, ...]:
+            return tuple(image.narrow(axis, k, length - 2) for k in range(3))
+
+        before, middle, after = triple(z)
+        known = (before > 0) & (middle > 0) & (after > 0)
+        left, here, right = triple(wanted)
+        edge = ((here - left) ** 2 + (here - right) ** 2).mean(dim=2)
+        weight = torch.where(known, torch.exp(-EDGE_DECAY * edge) * triple(share)[1], 0.0)
+        bend = middle - 2 * before * after / (before + after).clamp_min(1e-6)
+        total = total + (weight * bend.abs()).sum()
+    return total
+
+
+class ImageLoss(NamedTuple):
+    """The loss of one view and its terms, scalars; see `fused_step`."""
+
+    total: Tensor
+    l1: Tensor
+    ssim: Tensor  # 1 - SSIM
+    depth: Tensor
+    smooth: Tensor
+
+
 def image_loss(
     images: Tensor, exposure: Tensor, target: Target, weights: LossWeights
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return total, L1, 1 - SSIM and depth loss of `images`, [H, W, 6]; see `fused_step`."""
-    weight = torch.from_numpy(target.weight).to(images.dtype)
+) -> ImageLoss:
+    """Compare `images`, [H, W, 6] as `blend` orders them, with the target; see `fused_step`."""
+    weight = torch.from_numpy(target.weight).to(images)
     mask = weight > 0
     weight = torch.where(mask, weight, torch.zeros_like(weight))
     share = weight / weight.sum().clamp_min(1e-30)
-    wanted = torch.from_numpy(target.color).to(images.dtype)
+    wanted = torch.from_numpy(target.color).to(images)
     wanted = torch.where(mask[..., None], wanted, torch.zeros_like(wanted))
     seen = torch.exp(exposure[0]) * images[..., _COLOR] + exposure[1]
     l1 = (share * (seen - wanted).abs().mean(dim=2)).sum()
     ssim = masked_ssim(seen.permute(2, 0, 1), wanted.permute(2, 0, 1), mask.to(images.dtype))
     dissimilarity = (share * (1 - ssim.mean(dim=0))).sum()
-    depth = torch.from_numpy(target.depth).to(images.dtype)
+    smooth = smoothness(images, wanted, share) if weights.smooth > 0 else torch.zeros_like(l1)
+    depth = torch.from_numpy(target.depth).to(images)
     known = (depth > 0) & (depth < 1e30)
     depth = torch.where(known, depth, torch.zeros_like(depth))
     share = known * weight / (known * weight).sum().clamp_min(1e-30)
     error = (share * (images[..., _DEPTH] - images[..., _SILHOUETTE] * depth).abs()).sum()
     color = (1 - weights.ssim) * l1 + weights.ssim * dissimilarity
-    return weights.color * color + weights.depth * error, l1, dissimilarity, error
+    total = weights.color * color + weights.depth * error + weights.smooth * smooth
+    return ImageLoss(total, l1, dissimilarity, error, smooth)
 
 
 class _View:
@@ -344,16 +400,14 @@ class TorchBackend:
         images, total, _ = view.images()
         images.requires_grad_()
         exposure = torch.tensor(target.exposure, dtype=torch.float64, requires_grad=True)
-        loss, l1, ssim, depth = image_loss(images, exposure, target, weights)
-        torch.autograd.backward(loss)
+        loss = image_loss(images, exposure, target, weights)
+        torch.autograd.backward(loss.total)
         assert images.grad is not None and exposure.grad is not None
         return FusedResult(
-            float(loss.detach()),
-            float(l1.detach()),
-            float(ssim.detach()),
-            float(depth.detach()),
+            *(float(term.detach()) for term in loss[:4]),
             view.differentiate(images.grad),
             exposure.grad.numpy().astype(np.float32),
             total.numpy().astype(np.float32),
             _rendered(images) if with_images else None,
+            float(loss.smooth.detach()),
         )

@@ -88,13 +88,15 @@ class LossWeights:
     """
     How the terms of a view's loss add up.
 
-    loss = color * [(1 - ssim) * L1 + ssim * (1 - SSIM)] + depth * L_depth; `color` is lambda_psim
-    of Eq. 7 and `ssim` gamma of Eq. 9.
+    loss = color * [(1 - ssim) * L1 + ssim * (1 - SSIM)] + depth * L_depth + smooth * L_smooth;
+    `color` is lambda_psim of Eq. 7, `ssim` gamma of Eq. 9 and `smooth` the weight of the first
+    term of Eq. 8, whose edge-aware form `rasterize_torch.smoothness` defines.
     """
 
     color: float
     ssim: float
     depth: float
+    smooth: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -115,6 +117,8 @@ class FusedResult:
     """[N] sum of a Gaussian's weights over the pixels; 0 = this view says nothing about it."""
     rendered: Rendered | None = None
     """Before exposure; only if asked for."""
+    smooth: float = 0.0
+    """Mean departure of depth from planes in metres, edges left out; 0 if not weighted."""
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ from bdgs_ros.mapping.rasterize import (
 
 CAMERA = PinholeCamera(48, 40, 45.0, 47.0, 23.3, 20.3)
 T_CAMERA_WORLD = se3.exp(np.array([0.1, -0.2, 0.3, 0.2, -0.3, 0.4]))
-WEIGHTS = LossWeights(color=0.85, ssim=0.2, depth=0.3)
+WEIGHTS = LossWeights(color=0.85, ssim=0.2, depth=0.3, smooth=0.4)
 EXPOSURE = (0.1, -0.02)
 NATIVES = [name for name in available_backends() if name != 'torch']
 PARAMETERS = ('means', 'quats', 'log_scales', 'logit_opacities', 'colors')
@@ -137,7 +137,7 @@ def test_fused_step_agrees_with_autograd(name: str, seed: int) -> None:
     g = make_gaussians(seed=seed)
     target = make_target(g)
     ours, twin = step(g, target, backend=name), step(g, target, backend='torch')
-    for field in ('loss', 'l1', 'ssim', 'depth'):
+    for field in ('loss', 'l1', 'ssim', 'depth', 'smooth'):
         assert getattr(ours, field) == pytest.approx(getattr(twin, field), rel=3e-5), field
     assert_gradients_agree(ours.gradients, twin.gradients, 1e-4)
     assert error(ours.exposure_gradient, twin.exposure_gradient) < 1e-4
@@ -145,13 +145,14 @@ def test_fused_step_agrees_with_autograd(name: str, seed: int) -> None:
 
 
 @native
-@pytest.mark.parametrize('term', ['color', 'ssim', 'depth'])
+@pytest.mark.parametrize('term', ['color', 'ssim', 'depth', 'smooth'])
 def test_each_loss_term_agrees_alone(term: str) -> None:
     """No term hides behind another; measured at most 4e-5 (SSIM)."""
     weights = {
         'color': LossWeights(1.0, 0.0, 0.0),
         'ssim': LossWeights(1.0, 1.0, 0.0),
         'depth': LossWeights(0.0, 0.0, 1.0),
+        'smooth': LossWeights(0.0, 0.0, 0.0, 1.0),
     }[term]
     g = make_gaussians(seed=3)
     target = make_target(g)
@@ -161,6 +162,59 @@ def test_each_loss_term_agrees_alone(term: str) -> None:
     for name in ('means', 'quats', 'log_scales', 'logit_opacities', 'pose'):
         a, b = getattr(ours.gradients, name), getattr(twin.gradients, name)
         assert error(a, b) < 1e-4, name
+
+
+def slanted_wall(camera: PinholeCamera) -> Gaussians:
+    """Flat discs, 1.5 px wide, on the plane z = 2 + x that they all lie in."""
+    v, u = np.mgrid[-6 : camera.height + 6, -6 : camera.width + 6].reshape(2, -1)
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 0 * u + 1], 1)
+    z = 2 / (1 - rays[:, 0])
+    count, half = len(z), np.pi / 8
+    arrays = (
+        rays * z[:, None],
+        np.tile([np.cos(half), 0, -np.sin(half), 0], (count, 1)),
+        np.log(np.stack([1.5 * z / camera.fx] * 2 + [0 * z + 1e-3], axis=1)),
+        np.full(count, 1.0),
+        np.full((count, 3), 0.5),
+        np.zeros(count),
+    )
+    return Gaussians(*(a.astype(np.float32) for a in arrays))
+
+
+@pytest.mark.parametrize('name', available_backends())
+def test_smoothness_wants_planes_and_leaves_edges(name: str) -> None:
+    """A slanted wall is smooth, a step is not, a step under an edge of the target is less."""
+    camera = PinholeCamera(32, 24, 40.0, 40.0, 16.0, 12.0)
+    ones = np.ones(camera.shape, np.float32)
+    plain = np.full((*camera.shape, 3), 0.5, np.float32)
+    edged = plain.copy()
+    edged[:, 16:] = 1.0
+
+    def smooth(g: Gaussians, color: np.ndarray) -> float:
+        weights = LossWeights(0.0, 0.0, 0.0, 1.0)
+        return fused_step(g, np.eye(4), camera, color, ones, ones, weights, backend=name).smooth
+
+    wall = slanted_wall(camera)
+    nearer = wall.means * np.where(wall.means[:, :1] > 0, 0.7, 1.0).astype(np.float32)
+    step = replace(wall, means=nearer)
+    slope = 2 / camera.fx  # of the wall, metres per px
+    assert smooth(wall, plain) < 0.02 * slope
+    assert smooth(step, plain) > 20 * smooth(wall, plain)
+    assert smooth(step, edged) < 0.7 * smooth(step, plain)
+
+
+@pytest.mark.parametrize('name', available_backends())
+def test_holes_are_not_rough(name: str) -> None:
+    """Where less than half is covered there is no surface."""
+    camera = PinholeCamera(32, 24, 40.0, 40.0, 16.0, 12.0)
+    ones = np.ones(camera.shape, np.float32)
+    weights = LossWeights(0.0, 0.0, 0.0, 1.0)
+    g = slanted_wall(camera)
+    left = Gaussians(*(a[g.means[:, 0] < 0] for a in g.arrays()))
+    color = np.full((*camera.shape, 3), 0.5, np.float32)
+    result = fused_step(left, np.eye(4), camera, color, ones, ones, weights, backend=name)
+    whole = fused_step(g, np.eye(4), camera, color, ones, ones, weights, backend=name)
+    assert 0 < result.smooth < 3 * whole.smooth  # to black would be a cliff of 2 m
 
 
 def test_twin_pose_gradient_agrees_with_finite_differences(
