@@ -404,10 +404,13 @@ class TorchBackend:
         torch.autograd.backward(loss.total)
         assert images.grad is not None and exposure.grad is not None
         return FusedResult(
-            *(float(term.detach()) for term in loss[:4]),
+            loss.total.item(),
+            loss.l1.item(),
+            loss.ssim.item(),
+            loss.depth.item(),
             view.differentiate(images.grad),
             exposure.grad.numpy().astype(np.float32),
             total.numpy().astype(np.float32),
             _rendered(images) if with_images else None,
-            float(loss.smooth.detach()),
+            loss.smooth.item(),
         )
