@@ -30,6 +30,7 @@ What stays different from the twin (docs/cuda.md has the figures):
 from __future__ import annotations
 
 import importlib
+import logging
 from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any
@@ -56,6 +57,8 @@ from bdgs_ros.mapping.rasterize_types import (
     Scene,
     Target,
 )
+
+_LOGGER = logging.getLogger(__name__)
 
 _TILE = 16
 _MAX_ALPHA = 0.999  # gsplat's
@@ -104,12 +107,6 @@ class GsplatBackend:
     def __init__(self, functions: Any = None, device: str = 'cuda') -> None:
         self._device = torch.device(device)
         self._gsplat = functions or _load_gsplat(self._device)
-
-    @property
-    def device_name(self) -> str:
-        """The name of the graphics card."""
-        cuda = self._device.type == 'cuda'
-        return str(torch.cuda.get_device_name(self._device)) if cuda else str(self._device)
 
     def render(self, scene: Scene, statistics: bool) -> Rendered:
         """Render `scene`."""
@@ -168,6 +165,8 @@ def _load_gsplat(device: torch.device) -> Any:
             f'gsplat cannot run on {device}: {error}; it needs an NVIDIA driver and either its '
             'compiled kernels or a CUDA toolkit (nvcc) of the version torch was built with'
         ) from error
+    card = torch.cuda.get_device_name(device) if device.type == 'cuda' else device
+    _LOGGER.info('gsplat %s runs on %s', getattr(gsplat, '__version__', ''), card)
     return gsplat
 
 

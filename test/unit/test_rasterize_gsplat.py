@@ -406,10 +406,14 @@ def test_a_gsplat_that_fails_to_load_says_what_it_needs(monkeypatch: pytest.Monk
         RealBackend(device='cpu')
 
 
-def test_gsplat_is_warmed_up_with_valid_arguments(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The call that makes it compile."""
+def test_gsplat_is_warmed_up_with_valid_arguments(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The call that makes it compile; then the device is logged."""
     monkeypatch.setitem(sys.modules, 'gsplat', gsplat_stand_in)
-    assert RealBackend(device='cpu').device_name == 'cpu'
+    with caplog.at_level(logging.INFO):
+        RealBackend(device='cpu')
+    assert any('runs on cpu' in r.message for r in caplog.records)
 
 
 def test_torch_is_not_imported_to_look_for_gsplat() -> None:

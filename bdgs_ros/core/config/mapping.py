@@ -92,7 +92,9 @@ class MappingConfig:
         64, 'keyframes whose images are kept; of others only the Gaussians', low=2, high=100000
     )
     threads: int = param(2, 'threads of the rasteriser', low=1, high=64)
-    backend: str = param('auto', 'rasteriser', choices=('auto', 'native', 'torch'))
+    backend: str = param(
+        'auto', 'rasteriser; gsplat needs CUDA', choices=('auto', 'gsplat', 'native', 'torch')
+    )
     seed: int = param(0, 'of the choice of keyframes', low=0)
     loss: LossConfig = field(default_factory=LossConfig)
     rate: LearningRateConfig = field(default_factory=LearningRateConfig)
