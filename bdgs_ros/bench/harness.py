@@ -3,7 +3,9 @@ The harness of all benches: run cells, keep each result, write `results.json` an
 
 A bench is a module with `NAME`, `PROTOCOL` (one paragraph), `cells(options)`,
 `run_cell(cell, options)` and `summarise(rows)`. Every finished cell is a file of its own, so a
-run that was interrupted goes on where it stopped.
+run that was interrupted goes on where it stopped. Two more things are optional: `TABLES`, titles
+with the columns of each, where one table would be too wide; and `ISOLATED = True`, which gives
+every cell a process of its own, so that its peak of memory is not that of the cell before.
 """
 
 from __future__ import annotations
@@ -12,10 +14,12 @@ import fnmatch
 import hashlib
 import json
 import logging
+import multiprocessing
 import re
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -23,9 +27,10 @@ from typing import Any, Protocol
 from bdgs_ros.core.errors import BdgsError
 from bdgs_ros.eval import provenance
 from bdgs_ros.eval.files import write_text
-from bdgs_ros.eval.metric import dump_json, jsonable, markdown_table
+from bdgs_ros.eval.metric import dump_json, format_value, jsonable, markdown_table
 
 _LOGGER = logging.getLogger(__name__)
+_IDENTITY = ('sequence', 'configuration', 'seed')
 
 
 @dataclass(frozen=True)
@@ -65,6 +70,10 @@ class Options:
     weights: Path | None = None
     values: Mapping[str, Any] = field(default_factory=dict)
     """Parameters that differ from the defaults, for every configuration."""
+    all_cells: bool = False
+    """Measure also what the bench leaves out by default."""
+    refine_s: float = 60.0
+    """Seconds of refinement after a run; 0 for none."""
 
 
 class Bench(Protocol):
@@ -135,7 +144,7 @@ def _cell_row(bench: Bench, cell: Cell, options: Options, force: bool) -> dict[s
     row = {'sequence': cell.sequence, 'configuration': cell.configuration, 'seed': cell.seed}
     start = time.perf_counter()
     try:
-        row.update(bench.run_cell(cell, options))
+        row.update(_measure(bench, cell, options))
     except BdgsError as error:
         _LOGGER.warning('%s failed: %s', cell.label, error)
         return {**row, 'error': str(error)}
@@ -145,12 +154,22 @@ def _cell_row(bench: Bench, cell: Cell, options: Options, force: bool) -> dict[s
     return row
 
 
+def _measure(bench: Bench, cell: Cell, options: Options) -> dict[str, Any]:
+    if not getattr(bench, 'ISOLATED', False):
+        return bench.run_cell(cell, options)
+    # spawn: a fork would start with the memory, and the threads, of this process
+    context = multiprocessing.get_context('spawn')
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        return pool.submit(bench.run_cell, cell, options).result()
+
+
 def _document(bench: Bench, options: Options, rows: list[dict[str, Any]]) -> dict[str, Any]:
     good = [row for row in rows if 'error' not in row]
     return {
         'bench': bench.NAME,
         'summary': bench.summarise(good) if good else {},
         'rows': rows,
+        'tables': {k: list(v) for k, v in getattr(bench, 'TABLES', {}).items()},
         'failed': len(rows) - len(good),
         'protocol': ' '.join(bench.PROTOCOL.split()),
         'quick': options.quick,
@@ -164,12 +183,30 @@ def to_markdown(results: Mapping[str, Any]) -> str:
     """Write results as a page: how they were made, the rows, the summary."""
     machine = results['provenance']['machine']
     hidden = ('commit', 'wall_s')
-    rows = [{k: v for k, v in row.items() if k not in hidden} for row in results['rows']]
+    rows = [{k: _cell_text(v) for k, v in r.items() if k not in hidden} for r in results['rows']]
     summary = [{'figure': k, 'value': v} for k, v in results['summary'].items()]
     quick = ' Quick: shortened, not for comparison.' if results['quick'] else ''
     return (
         f'# bdgs bench {results["bench"]}\n\n{results["protocol"]}{quick}\n\n'
         f'Commit {", ".join(results["commits"]) or "-"}; {machine["processor"]}, '
         f'{machine["cores"]} cores; Python {machine["python"]}.\n\n'
-        f'{markdown_table(rows)}\n{markdown_table(summary)}'
+        f'{_tables(rows, results["tables"])}\n{markdown_table(summary)}'
     )
+
+
+def _tables(rows: list[dict[str, Any]], tables: Mapping[str, Sequence[str]]) -> str:
+    """Write all columns in one table, or those of each title for the rows that have any."""
+    if not tables:
+        return markdown_table(rows)
+    pages = []
+    for title, columns in tables.items():
+        chosen = [r for r in rows if 'error' in r or any(r.get(c) is not None for c in columns)]
+        names = [*_IDENTITY, *columns, *(['error'] if any('error' in r for r in chosen) else [])]
+        if chosen:
+            pages.append(f'## {title}\n\n{markdown_table(chosen, names)}')
+    return '\n'.join(pages)
+
+
+def _cell_text(value: Any) -> Any:
+    """Write a list of figures as one cell."""
+    return ' / '.join(map(format_value, value)) if isinstance(value, list) else value

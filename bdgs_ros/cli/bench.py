@@ -17,13 +17,16 @@ from bdgs_ros.eval.metric import dump_json
 NAME = 'bench'
 HELP = 'measure accuracy or speed; finished cells are kept, so an interrupted bench goes on'
 
-_BENCHES = ('slam', 'rasterizer')
+_BENCHES = ('slam', 'mapping', 'rasterizer')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument('name', choices=_BENCHES, help='what to measure')
     parser.add_argument('--quick', action='store_true', help='few and short cells, as a check')
+    parser.add_argument(
+        '--all', action='store_true', help='cells too that the bench leaves out by default'
+    )
     parser.add_argument(
         '--only',
         action='append',
@@ -48,6 +51,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=Path('benchmarks/work'),
         metavar='DIR',
         help='where results and synthetic recordings are kept (default: %(default)s)',
+    )
+    parser.add_argument(
+        '--refine-seconds',
+        type=float,
+        default=Options.refine_s,
+        metavar='S',
+        help='bench mapping: refinement after each run, 0 for none (default: %(default)g)',
     )
     parser.add_argument('--weights', type=Path, metavar='ONNX', help='weights of the detector')
     parser.add_argument(
@@ -78,6 +88,8 @@ def run(arguments: argparse.Namespace) -> int:
         seeds=tuple(range(arguments.seeds)),
         weights=arguments.weights,
         values=values,
+        all_cells=arguments.all,
+        refine_s=arguments.refine_seconds,
     )
     results = run_bench(load(arguments.name), options, arguments.only, arguments.force)
     sys.stdout.write(dump_json(results) + '\n' if arguments.json else to_markdown(results))

@@ -187,6 +187,7 @@ def mean_scores(scores: Sequence[Mapping[str, float]]) -> list[Metric]:
 _UNITS = {
     'psnr': 'dB',
     'psnr_exposure_fit': 'dB',
+    'psnr_seen': 'dB',
     'psnr_hidden': 'dB',
     'ssim': '',
     'lpips': '',
@@ -211,12 +212,14 @@ def _scores(
     perceptual: Perceptual | None,
 ) -> dict[str, float]:
     fitted = rendering.fit_exposure(view.color, color, valid)
+    seen = view.silhouette > _SEEN
     scores = {
         'psnr': rendering.psnr(view.color, color, valid),
         'psnr_exposure_fit': rendering.psnr(fitted, color, valid),
+        'psnr_seen': rendering.psnr(view.color, color, valid & seen),
         'ssim': rendering.ssim(view.color, color, valid),
         'depth_l1': 100.0 * rendering.depth_l1(view.depth_m, depth, valid),
-        'seen': 100.0 * float(np.mean(view.silhouette > _SEEN)),
+        'seen': 100.0 * float(np.mean(seen)),
     }
     if perceptual is not None:
         scores['lpips'] = perceptual(view.color, color, valid)

