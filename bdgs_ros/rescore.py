@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +67,7 @@ def rescore(
     mapper = Mapper(config.mapping, config.belief)
     mapper.load(folder / 'map.ply')
     truth = open_truth(recording)
-    result, labels = _relabel(sequence, est, config, truth)
+    result, labels = relabel(sequence, est, config, truth, frozenset(mapper.keyframe_stamps_ns))
     metrics = write_results(
         folder,
         result,
@@ -96,9 +96,42 @@ def _known_results(path: Path) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def _relabel(
-    sequence: Any, est: Trajectory, config: BdgsConfig, truth: scores.Truth | None
+def relabel(
+    sequence: Any,
+    est: Trajectory,
+    config: BdgsConfig,
+    truth: scores.Truth | None,
+    keyframe_stamps_ns: Collection[int] = (),
 ) -> tuple[RunResult, Sequence[Metric]]:
+    """
+    Go through a recording again, with the poses it was given and a dynamic prior computed anew.
+
+    Parameters
+    ----------
+    sequence : Sequence
+        The recording.
+    est : Trajectory
+        Frames without a pose in it count as lost.
+    config : BdgsConfig
+        For the detection stage.
+    truth : Truth, optional
+        To score the prior with.
+    keyframe_stamps_ns : collection of int
+        Frames that the map was fitted to.
+
+    Returns
+    -------
+    result : RunResult
+        As if from a run.
+    labels : sequence of Metric
+        Precision and recall of the prior; empty without truth.
+
+    Raises
+    ------
+    EvaluationError
+        If no frame has a pose.
+
+    """
     from tqdm import tqdm
 
     from bdgs_ros.detection.stage import DetectionStage
@@ -107,7 +140,8 @@ def _relabel(
     stage, recorder, score = DetectionStage(config.detection), Recorder(), LabelScore()
     for frame in tqdm(sequence, 'labels', unit='frame', file=sys.stderr, leave=False):
         labels = stage.process(frame)
-        recorder.add(frame, _as_tracking(frame, labels, poses), {})
+        is_keyframe = frame.stamp_ns in keyframe_stamps_ns
+        recorder.add(frame, _as_tracking(frame, labels, poses, is_keyframe), {})
         if truth is not None:
             score = score + score_labels(labels.p_dynamic, truth.dynamic(frame.stamp_ns))
     result = recorder.result()
@@ -119,13 +153,15 @@ def _relabel(
     return result, [] if truth is None else score.metrics('prior')
 
 
-def _as_tracking(frame: RgbdFrame, labels: Labels, poses: Mapping[int, Any]) -> TrackingResult:
+def _as_tracking(
+    frame: RgbdFrame, labels: Labels, poses: Mapping[int, Any], is_keyframe: bool
+) -> TrackingResult:
     pose = poses.get(frame.stamp_ns)
     return TrackingResult(
         frame.stamp_ns,
         TrackingStatus.LOST if pose is None else TrackingStatus.OK,
         np.eye(4) if pose is None else pose,
         np.full((6, 6), np.nan),
-        False,
+        is_keyframe,
         labels.p_dynamic,
     )

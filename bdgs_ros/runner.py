@@ -49,8 +49,8 @@ class Slam(Protocol):
 class StaticMap(scores.Renderer, Protocol):
     """The map at the end of a run; see `bdgs_ros.mapping.mapper.Mapper`."""
 
-    def save(self, path: Path) -> None:
-        """Write the Gaussians as .ply."""
+    def save(self, path: Path, *, keyframes: bool = True) -> None:
+        """Write the Gaussians as .ply and, if wanted, the keyframes beside it."""
 
 
 Observer = Callable[[RgbdFrame, TrackingResult], None]
@@ -147,6 +147,7 @@ def write_results(
     frames_expected: int | None = None,
     extra: Mapping[str, Any] | None = None,
     save_map: bool = True,
+    keep_keyframes: bool = True,
     with_pictures: bool = True,
 ) -> dict[str, Any]:
     """
@@ -157,8 +158,8 @@ def write_results(
     Parameters
     ----------
     folder : Path
-        Gets `trajectory.txt` (TUM), `map.ply`, `metrics.json`, and the pictures `tiles.png`,
-        `animation.gif` and `trajectory.png`.
+        Gets `trajectory.txt` (TUM), `map.ply`, `map_keyframes`, `metrics.json`, and the pictures
+        `tiles.png`, `animation.gif` and `trajectory.png`.
     result : RunResult
         What `run_sequence` or a `Recorder` collected.
     static_map : Mapper, optional
@@ -179,6 +180,8 @@ def write_results(
         More entries for the metrics file, for example how the run was started.
     save_map : bool
         False where `map.ply` in the folder is the map already.
+    keep_keyframes : bool
+        Whether to write the images too that the map can be refined with.
     with_pictures : bool
         Whether to draw.
 
@@ -206,13 +209,13 @@ def write_results(
     views: list[scores.View] = []
     if static_map is not None:
         if save_map:
-            static_map.save(folder / 'map.ply')
+            static_map.save(folder / 'map.ply', keyframes=keep_keyframes)
         found += map_metrics(folder / 'map.ply')
         views = scores.render_samples(result.samples, static_map)
         found += scores.render_metrics(views, truth)
     if with_pictures:
         _draw(folder, est, views, ground_truth, ate, name)
-    metrics = _document(name, found, config, {**(extra or {}), 'notes': notes})
+    metrics = metrics_document(name, found, config, {**(extra or {}), 'notes': notes})
     write_text(folder / 'metrics.json', dump_json(metrics) + '\n')
     return metrics
 
@@ -274,12 +277,13 @@ def _draw(
         plots.plot_trajectory(folder / 'trajectory.png', est, ground_truth, ate, name)
 
 
-def _document(
+def metrics_document(
     name: str,
     metrics: Iterable[Metric],
     config: BdgsConfig | None,
     extra: Mapping[str, Any],
 ) -> dict[str, Any]:
+    """Return the content of `metrics.json`: figures, how they came about, and on what."""
     values = {} if config is None else {spec.name: spec.value for spec in specs(config)}
     return {
         'sequence': name,

@@ -8,12 +8,24 @@ import sys
 from collections.abc import Sequence
 from types import ModuleType
 
-from bdgs_ros.cli import bench, config, convert, demo, eval, info, report, run, synth
+from bdgs_ros.cli import (
+    bench,
+    config,
+    convert,
+    demo,
+    eval,
+    export,
+    info,
+    refine,
+    report,
+    run,
+    synth,
+)
 from bdgs_ros.core.errors import BdgsError
 
 # Each has NAME, HELP, add_arguments(parser) and run(arguments) -> exit code.
 _MODULES: tuple[ModuleType, ...] = (
-    synth, convert, info, run, eval, report, bench, config, demo,
+    synth, convert, info, run, refine, export, eval, report, bench, config, demo,
 )  # fmt: skip
 
 _FAILED = 2

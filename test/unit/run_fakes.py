@@ -94,7 +94,9 @@ class FakeMapper:
             color, np.full(camera.shape, 2.1, np.float32), np.ones(camera.shape, np.float32)
         )
 
-    def save(self, path: Path) -> None:
+    keyframe_stamps_ns: tuple[int, ...] = ()
+
+    def save(self, path: Path, *, keyframes: bool = True) -> None:
         path.write_bytes(b'ply\nformat binary_little_endian 1.0\nelement vertex 7\nend_header\n')
 
 
