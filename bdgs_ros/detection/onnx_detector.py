@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -20,28 +21,31 @@ _EXPECTED = (
     "'export.py --include onnx' of YOLOv5 writes them"
 )
 _FREE_SIZE = 320  # the input size when the file leaves it open
-_PROVIDERS = {
-    'cpu': ('CPUExecutionProvider',),
-    'cuda': ('CUDAExecutionProvider',),
-    'auto': ('CUDAExecutionProvider', 'CPUExecutionProvider'),
-}
+_CPU, _CUDA = 'CPUExecutionProvider', 'CUDAExecutionProvider'
+_PROVIDERS = {'cpu': (_CPU,), 'cuda': (_CUDA,), 'auto': (_CUDA, _CPU)}
+# The default tries every algorithm of every layer at the first image, which takes seconds.
+_CUDA_OPTIONS = {'cudnn_conv_algo_search': 'HEURISTIC'}
+
+_LOGGER = logging.getLogger(__name__)
 
 
 class OnnxDetector:
     """
     A YOLOv5 network.
 
-    The input size and, where the file tells them, the class names are read from the file.
+    The input size and, where the file tells them, the class names are read from the file. It runs
+    on CUDA where onnxruntime has it, unless `provider` says otherwise.
 
     Parameters
     ----------
     config : DetectionConfig
-        `weights` is the path of the file.
+        `weights` is the path of the file; `provider` 'auto', 'cpu' or 'cuda'.
 
     Raises
     ------
     ModelError
-        If the file cannot be read, is not a YOLOv5 detector, or CUDA is demanded and absent.
+        If the file cannot be read, is not a YOLOv5 detector, or CUDA is demanded and cannot be
+        used.
 
     """
 
@@ -115,18 +119,33 @@ def _open_session(path: Path, config: DetectionConfig) -> Any:
             f"no weights file '{path}'; give detection.weights the path of a YOLOv5 ONNX file, "
             'or leave it empty to use the geometric prior alone'
         )
+    providers = _providers(config.provider)
     try:
-        return onnxruntime.InferenceSession(
-            str(path), _session_options(config), providers=_providers(config.provider)
+        session = onnxruntime.InferenceSession(
+            str(path), _session_options(config), providers=providers
         )
-    except ModelError:
-        raise
     except Exception as error:  # onnxruntime has no common base for its exceptions
         size = path.stat().st_size
         raise ModelError(
             f"'{path}' ({size} bytes) cannot be read as an ONNX network: {error}; "
             'was it downloaded completely?'
         ) from error
+    _check_provider(session.get_providers()[0], config.provider, [name for name, _ in providers])
+    return session
+
+
+def _check_provider(used: str, wanted: str, offered: list[str]) -> None:
+    """Say what the network runs on: onnxruntime turns to the CPU where CUDA fails to start."""
+    if used == offered[0]:
+        _LOGGER.info("detector: onnxruntime's %s (detection.provider is '%s')", used, wanted)
+        return
+    complaint = (
+        f'{offered[0]} is built into this onnxruntime but did not start, which leaves {used}; '
+        'it needs an NVIDIA driver, and CUDA and cuDNN of the versions it was built for'
+    )
+    if wanted == 'cuda':
+        raise ModelError(f"detection.provider is 'cuda', but {complaint}")
+    _LOGGER.warning('%s', complaint)
 
 
 def _session_options(config: DetectionConfig) -> Any:
@@ -139,7 +158,8 @@ def _session_options(config: DetectionConfig) -> Any:
     return options
 
 
-def _providers(wanted: str) -> list[str]:
+def _providers(wanted: str) -> list[tuple[str, dict[str, str]]]:
+    """Return names and options of the execution providers to try, best first."""
     available = onnxruntime.get_available_providers()
     usable = [p for p in _PROVIDERS[wanted] if p in available]
     if not usable:
@@ -147,4 +167,6 @@ def _providers(wanted: str) -> list[str]:
             f"detection.provider is '{wanted}', but this onnxruntime has only {available}; "
             "install onnxruntime-gpu, or set it to 'auto'"
         )
-    return usable
+    if _CUDA in usable and hasattr(onnxruntime, 'preload_dlls'):
+        onnxruntime.preload_dlls()  # finds the CUDA libraries that pip installed, torch's also
+    return [(p, _CUDA_OPTIONS if p == _CUDA else {}) for p in usable]

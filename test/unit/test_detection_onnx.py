@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +14,11 @@ from bdgs_ros.core.config.detection import DetectionConfig
 from bdgs_ros.core.errors import ModelError
 from bdgs_ros.detection.detector import NullDetector, make_detector
 
-pytest.importorskip('onnxruntime')
+onnxruntime = pytest.importorskip('onnxruntime')
+onnx_detector = pytest.importorskip('bdgs_ros.detection.onnx_detector')
 
 FLOAT, INT64 = 1, 7
+CPU, CUDA = 'CPUExecutionProvider', 'CUDAExecutionProvider'
 
 
 def _varint(value: int) -> bytes:
@@ -133,14 +137,91 @@ def test_no_weights_means_the_null_detector() -> None:
 
 def test_cuda_that_is_not_there_is_an_error_only_when_demanded(write: Write) -> None:
     """`auto` takes what there is."""
-    import onnxruntime
-
-    if 'CUDAExecutionProvider' in onnxruntime.get_available_providers():
+    if CUDA in onnxruntime.get_available_providers():
         pytest.skip('this onnxruntime has CUDA')
     config = write(tiny_network())
     make_detector(DetectionConfig(weights=config.weights, provider='auto'))
     with pytest.raises(ModelError, match=r'detection\.provider'):
         make_detector(DetectionConfig(weights=config.weights, provider='cuda'))
+
+
+class FakeRuntime:
+    """An onnxruntime with CUDA built in, whose sessions start on `starts`."""
+
+    SessionOptions = onnxruntime.SessionOptions
+
+    def __init__(self, starts: str) -> None:
+        self.starts = starts
+        self.preloaded = False
+        self.asked: list[tuple[str, dict[str, str]]] = []
+
+    def get_available_providers(self) -> list[str]:
+        """As onnxruntime-gpu does, whether or not there is a card."""
+        return ['TensorrtExecutionProvider', CUDA, CPU]
+
+    def preload_dlls(self) -> None:
+        """Note the call."""
+        self.preloaded = True
+
+    def InferenceSession(self, path: str, options: object, providers: list) -> object:
+        """Open the network on the CPU, and claim to be elsewhere."""
+        self.asked = providers
+        session = onnxruntime.InferenceSession(path, options, providers=[CPU])
+        used = [self.starts, CPU] if self.starts == CUDA else [CPU]
+        session.get_providers = lambda: used
+        return session
+
+
+def fake_runtime(monkeypatch: pytest.MonkeyPatch, starts: str) -> FakeRuntime:
+    """Put a `FakeRuntime` in onnxruntime's place."""
+    fake = FakeRuntime(starts)
+    monkeypatch.setattr(onnx_detector, 'onnxruntime', fake)
+    return fake
+
+
+@pytest.mark.parametrize('provider', ['auto', 'cuda'])
+def test_cuda_is_taken_where_it_is_offered(
+    write: Write, monkeypatch: pytest.MonkeyPatch, provider: str
+) -> None:
+    """And its libraries are looked for beside torch's first."""
+    fake = fake_runtime(monkeypatch, CUDA)
+    detector = make_detector(replace(write(tiny_network()), provider=provider))
+    assert detector.name == 'net.onnx on cuda'
+    assert fake.preloaded and fake.asked[0][0] == CUDA
+    assert fake.asked[0][1] == {'cudnn_conv_algo_search': 'HEURISTIC'}
+
+
+def test_cpu_can_be_demanded_where_cuda_is_offered(
+    write: Write, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The override."""
+    fake = fake_runtime(monkeypatch, CPU)
+    detector = make_detector(write(tiny_network()))
+    assert detector.name == 'net.onnx on cpu'
+    assert fake.asked == [(CPU, {})] and not fake.preloaded
+
+
+def test_cuda_that_does_not_start_is_a_warning_or_an_error(
+    write: Write, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Onnxruntime itself turns to the CPU in silence."""
+    fake_runtime(monkeypatch, CPU)
+    config = write(tiny_network())
+    with caplog.at_level(logging.WARNING):
+        assert make_detector(replace(config, provider='auto')).name == 'net.onnx on cpu'
+    assert sum('did not start' in r.message for r in caplog.records) == 1
+    with pytest.raises(ModelError, match=r"provider is 'cuda', but .*did not start.*driver"):
+        make_detector(replace(config, provider='cuda'))
+
+
+def test_a_real_cuda_runs_the_network(write: Write) -> None:
+    """Where there is one."""
+    if CUDA not in onnxruntime.get_available_providers():
+        pytest.skip('this onnxruntime has no CUDA: install onnxruntime-gpu beside a CUDA device')
+    detector = make_detector(replace(write(tiny_network(answer=one_person())), provider='cuda'))
+    (found,) = detector.detect(np.zeros((48, 64, 3), np.uint8))
+    assert detector.name == 'net.onnx on cuda'
+    assert found.box_xyxy == pytest.approx((24, 8, 40, 40))
 
 
 @pytest.mark.recording
