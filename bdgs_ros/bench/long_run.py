@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -13,12 +14,31 @@ from bdgs_ros.eval import memory
 from bdgs_ros.eval.recorder import FrameRow
 
 
+class CpuTimed:
+    """Stand in front of the mapper and note the processor time of each keyframe."""
+
+    def __init__(self, mapper: Any) -> None:
+        self._mapper = mapper
+        self.cpu_ms: list[float] = []
+
+    def process(self, keyframe: Any) -> Any:
+        """Pass the keyframe on."""
+        start = time.process_time()
+        try:
+            return self._mapper.process(keyframe)
+        finally:
+            self.cpu_ms.append(1e3 * (time.process_time() - start))
+
+    def __getattr__(self, name: str) -> Any:
+        """Be the mapper in everything else."""
+        return getattr(self._mapper, name)
+
+
 @dataclass
 class BlockWatch:
     """Watch a run: Gaussians after each keyframe, peak of memory in each block of frames."""
 
-    mapper: Any
-    """Has `map`, of which `len` is the number of Gaussians."""
+    mapper: CpuTimed
     block: int
     gaussians: list[tuple[int, int]] = field(default_factory=list)
     """(frame, Gaussians) of every keyframe."""
@@ -60,20 +80,30 @@ def columns(rows: Sequence[FrameRow], watch: BlockWatch) -> dict[str, Any]:
     times = [
         _median([r.times_ms['mapping'] for r in b if 'mapping' in r.times_ms]) for b in blocks
     ]
-    sizes = [[n for i, n in watch.gaussians if i // watch.block == b] for b in range(count)]
-    settled = times[1:] or times
+    kept = watch.gaussians
+    sizes = [[n for i, n in kept if i // watch.block == b] for b in range(count)]
+    costs = zip(kept, watch.mapper.cpu_ms, strict=True)
+    by_block = [(i // watch.block, ms) for (i, _), ms in costs]
+    cpu = [_median([ms for of, ms in by_block if of == b]) for b in range(count)]
     return {
         'block_frames': watch.block,
         'block_mapping_ms': [round(t, 1) for t in times],
+        'block_mapping_cpu_ms': [round(t, 1) for t in cpu],
         'block_tracking_ms': [
             round(_median([r.times_ms['tracking'] for r in b]), 1) for b in blocks
         ],
         'block_keyframes': [len(s) for s in sizes],
         'block_gaussians': [round(_median(s)) if s else None for s in sizes],
         'block_peak_mb': [round(p) for p in watch.peaks_mb],
-        'last_over_second': settled[-1] / settled[0],
-        'growth': float(np.nanmax(settled)) / settled[0],
+        'last_over_second': times[-1] / (times[1:] or times)[0],
+        'growth': _growth(times),
+        'cpu_growth': _growth(cpu),
     }
+
+
+def _growth(costs: Sequence[float]) -> float:
+    settled = costs[1:] or costs
+    return float(np.nanmax(settled)) / settled[0]
 
 
 def _median(values: Sequence[float]) -> float:

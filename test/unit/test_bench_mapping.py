@@ -94,12 +94,17 @@ def rows_of(times):
 
 def test_growth_is_over_the_second_block():
     times = [100.0, None, 200.0, None, 210.0, 190.0, 220.0, None, 240.0]
-    mapper = SimpleNamespace(map=[0] * 7)
+    mapper = long_run.CpuTimed(SimpleNamespace(map=[0] * 7, process=lambda keyframe: keyframe))
     watch = long_run.BlockWatch(mapper, 2)
     for time_ms in times:
+        if time_ms is not None:
+            assert mapper.process(time_ms) == time_ms
         watch(None, SimpleNamespace(is_keyframe=time_ms is not None))
     watch.finish()
+    mapper.cpu_ms = [1.0, 2.0, 2.0, 2.0, 3.0, 2.0]
     found = long_run.columns(rows_of(times), watch)
+    assert found['block_mapping_cpu_ms'] == [1.0, 2.0, 2.0, 3.0, 2.0]
+    assert found['cpu_growth'] == pytest.approx(1.5)
     assert found['block_mapping_ms'] == [100.0, 200.0, 200.0, 220.0, 240.0]
     assert found['block_keyframes'] == [1, 1, 2, 1, 1]
     assert found['block_gaussians'] == [7] * 5
@@ -134,14 +139,18 @@ def test_rows_of_a_short_run(recording, tmp_path, monkeypatch):
     values = {'mapping.iterations': 4, 'mapping.width': 80, 'mapping.threads': 1}
     values['tracking.keyframe.max_interval'] = 4
     options = Options(tmp_path, tmp_path, values=values)
-    settings = {'kind': 'synth', 'frames': 16, 'refine_s': 0.0}
+    settings = {'kind': 'synth', 'frames': 16, 'refine_s': 0.3}
     cell = Cell('synth_walking_xyz', 'geometric', 0, settings)
     quality = mapping.run_cell(cell, options)
     assert quality['frames'] == 16
     assert quality['live_views'] == 2
     assert quality['after_views'] == 3
     assert 5 < quality['after_psnr_db'] < 60
-    assert (tmp_path / 'runs' / cell.key / 'after.png').is_file()
+    assert quality['refined_views'] == 3
+    assert quality['refine_iterations'] > 3
+    assert quality['refined_psnr_db'] > quality['after_psnr_db']
+    for name in ('after.png', 'refined.png', 'map.ply', 'refined/map.ply', 'trajectory.txt'):
+        assert (tmp_path / 'runs' / cell.key / name).is_file()
     looped = Cell('loop_synth_walking_xyz', 'geometric', 0, {**settings, 'frames_run': 24})
     row = mapping.run_cell(looped, options)
     assert row['frames'] == 24
