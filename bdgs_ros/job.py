@@ -11,7 +11,7 @@ from typing import Any
 
 from bdgs_ros.core.config import BdgsConfig
 from bdgs_ros.core.errors import DatasetError
-from bdgs_ros.core.types import RgbdFrame
+from bdgs_ros.core.types import Pose, RgbdFrame
 from bdgs_ros.data.sequence import Sequence
 from bdgs_ros.data.synth.truth import SynthTruth
 from bdgs_ros.runner import LabelObserver, run_sequence, write_results
@@ -30,6 +30,14 @@ class Job:
     frames: int | None = None
     pictures: bool = True
     progress: bool = True
+    keyframes: bool = True
+    """Whether to leave the images too that the map can be refined with."""
+    map_file: Path | None = None
+    """Map to continue from."""
+    start_pose: Pose | None = None
+    """About where the camera starts in that map; by default its origin."""
+    localise: bool = False
+    """Leave that map as it is."""
 
 
 def run_job(job: Job) -> dict[str, Any]:
@@ -54,6 +62,8 @@ def run_job(job: Job) -> dict[str, Any]:
     truth = open_truth(job.recording)
     labels = None if truth is None else LabelObserver(truth)
     slam = BdgsSlam(job.config)
+    if job.map_file is not None:
+        slam.start_from(job.map_file, sequence.camera, job.start_pose, localise=job.localise)
     start = time.perf_counter()
     result = run_sequence(
         _with_progress(sequence, chosen, job.progress), slam, [] if labels is None else [labels]
@@ -69,6 +79,7 @@ def run_job(job: Job) -> dict[str, Any]:
         more=[] if labels is None else labels.score.metrics(),
         config=job.config,
         extra={'frames': [chosen.start, chosen.stop], 'wall_s': wall_s},
+        keep_keyframes=job.keyframes,
         with_pictures=job.pictures,
     )
 

@@ -7,12 +7,18 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from bdgs_ros.cli.config import add_config_arguments, load_config, with_weights
+from bdgs_ros.core import se3
+from bdgs_ros.core.errors import ConfigError
+from bdgs_ros.core.types import Pose
 from bdgs_ros.eval.metric import dump_json, markdown_table
 
 NAME = 'run'
 HELP = 'run a recording (folder or bag) without ROS; write trajectory, map, metrics, pictures'
 
+_POSE_NUMBERS = 7
 _SHOWN = (
     'frames_in', 'frames_lost', 'coverage', 'keyframes', 'ate_rmse', 'ate_mean', 'ate_std',
     'ate_max', 'rpe_translation_second_rmse', 'dynamic_precision', 'dynamic_recall',
@@ -34,6 +40,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--allow-truncated', action='store_true', help='use what is readable of a cut-off bag'
     )
     parser.add_argument('--no-pictures', action='store_true', help='leave the pictures out')
+    parser.add_argument(
+        '--no-keyframes', action='store_true', help='leave the images for `bdgs refine` out'
+    )
+    parser.add_argument(
+        '--map', type=Path, metavar='PLY', help='continue from this map instead of a new one'
+    )
+    parser.add_argument(
+        '--localise', action='store_true', help='with --map: track in the map, do not change it'
+    )
+    parser.add_argument(
+        '--start-pose',
+        metavar='"TX TY TZ QX QY QZ QW"',
+        help="with --map: about where the camera starts, in metres (default: the map's origin)",
+    )
     parser.add_argument('--json', action='store_true', help='print the metrics for machines')
     add_config_arguments(parser)
 
@@ -51,10 +71,34 @@ def run(arguments: argparse.Namespace) -> int:
         start=arguments.start,
         frames=arguments.frames,
         pictures=not arguments.no_pictures,
+        keyframes=not arguments.no_keyframes,
+        map_file=arguments.map,
+        start_pose=_start_pose(arguments),
+        localise=arguments.localise,
     )
     metrics = run_job(job)
     sys.stdout.write(dump_json(metrics) + '\n' if arguments.json else _summary(metrics))
     return 0
+
+
+def _start_pose(arguments: argparse.Namespace) -> Pose | None:
+    """Read `--start-pose`; raises `ConfigError` if it is no pose, or there is no map for it."""
+    if arguments.map is None and (arguments.localise or arguments.start_pose is not None):
+        raise ConfigError('--localise and --start-pose need a map: add --map FILE')
+    if arguments.start_pose is None:
+        return None
+    words = arguments.start_pose.replace(',', ' ').split()
+    try:
+        values = np.array([float(word) for word in words])
+    except ValueError:
+        values = np.zeros(0)
+    norm = np.linalg.norm(values[3:])
+    if len(values) != _POSE_NUMBERS or not np.isfinite(values).all() or not 0.5 < norm < 2.0:
+        raise ConfigError(
+            "--start-pose expects 'tx ty tz qx qy qz qw' (metres, unit quaternion), "
+            f"received '{arguments.start_pose}'"
+        )
+    return se3.from_position_quat_xyzw(values[:3], values[3:])
 
 
 def _summary(metrics: dict[str, Any]) -> str:

@@ -30,6 +30,9 @@ from bdgs_ros.tracking.movers import MoverMask
 
 _log = logging.getLogger(__name__)
 
+_START_SIGMA_M = 0.3  # how well the start in a known map is known
+_START_SIGMA_RAD = 0.3
+
 
 @dataclass(frozen=True)
 class Reference:
@@ -70,8 +73,23 @@ class CameraTracker:
         self._model: Reference | None = None
         self._keyframe_depth_m = 1.0
         self._frames_since_keyframe = 0
+        self._world_is_known = False
         self._motion.reset()
         self._movers.reset()
+
+    def start_from(self, view: ModelView) -> None:
+        """
+        Begin in a map that exists: the first frame is aligned to a view of it.
+
+        Parameters
+        ----------
+        view : ModelView
+            Rendered from about where the camera is. Frames are LOST until one fits to it.
+
+        """
+        self.reset()
+        self.set_model(view)
+        self._world_is_known = True
 
     def set_model(self, view: ModelView | None) -> None:
         """Take the static map as rendered at a keyframe, or None where there is no map."""
@@ -101,7 +119,8 @@ class CameraTracker:
         expected = np.maximum(prior, self._movers.expected(frame.camera.shape))
         current = self._aligner.pyramid(frame.color, frame.depth_m, expected, frame.camera)
         if self._keyframe is None:
-            return self._start(frame, current, prior)
+            first = self._enter if self._world_is_known else self._start
+            return first(frame, current, prior)
         predicted, covariance = self._motion.predict(frame.stamp_ns)
         information = np.asarray(np.linalg.inv(covariance), np.float64)
         coarse = self._align(self._keyframe, current, predicted, information)
@@ -131,6 +150,33 @@ class CameraTracker:
             p_dynamic,
             1.0,
             1.0,
+        )
+
+    def _enter(
+        self, frame: RgbdFrame, current: ImagePyramid, prior: ProbabilityImage
+    ) -> TrackingResult:
+        """Find the first frame in the known map, and make it a keyframe."""
+        assert self._model is not None
+        guess = self._model.T_world_camera
+        information = np.diag(1 / np.array([_START_SIGMA_M**2] * 3 + [_START_SIGMA_RAD**2] * 3))
+        coarse = self._align(self._model, current, guess, information)
+        p_dynamic = self._see_movers(prior, current, coarse)
+        current = self._aligner.with_dynamic(current, p_dynamic)
+        estimate = self._refine(current, coarse, information)
+        quality = estimate.quality
+        if not self._is_good(quality):
+            return self._lost(frame, guess, p_dynamic, quality)
+        self._motion.update(frame.stamp_ns, estimate.T_world_camera, quality.covariance)
+        self._become_keyframe(frame, estimate.T_world_camera, current)
+        return TrackingResult(
+            frame.stamp_ns,
+            TrackingStatus.OK,
+            estimate.T_world_camera,
+            quality.covariance,
+            True,
+            p_dynamic,
+            quality.inlier_ratio,
+            quality.overlap,
         )
 
     def _align(
