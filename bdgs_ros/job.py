@@ -12,8 +12,10 @@ from typing import Any
 from bdgs_ros.core.config import BdgsConfig
 from bdgs_ros.core.errors import DatasetError
 from bdgs_ros.core.types import Pose, RgbdFrame
+from bdgs_ros.data.loop import LoopedSequence, LoopedTruth
 from bdgs_ros.data.sequence import Sequence
 from bdgs_ros.data.synth.truth import SynthTruth
+from bdgs_ros.eval.scores import Truth
 from bdgs_ros.runner import LabelObserver, run_sequence, write_results
 
 
@@ -28,6 +30,8 @@ class Job:
     allow_truncated: bool = False
     start: int = 0
     frames: int | None = None
+    loop_frames: int | None = None
+    """Play the recording forth and back until there are so many; start and frames are of those."""
     pictures: bool = True
     progress: bool = True
     keyframes: bool = True
@@ -57,9 +61,8 @@ def run_job(job: Job) -> dict[str, Any]:
     """
     from bdgs_ros.pipeline import BdgsSlam
 
-    sequence = _open(job)
+    sequence, truth = _open(job)
     chosen = choose_frames(len(sequence), job.start, job.frames)
-    truth = open_truth(job.recording)
     labels = None if truth is None else LabelObserver(truth)
     slam = BdgsSlam(job.config)
     if job.map_file is not None:
@@ -84,10 +87,17 @@ def run_job(job: Job) -> dict[str, Any]:
     )
 
 
-def _open(job: Job) -> Sequence:
+def _open(job: Job) -> tuple[Sequence, Truth | None]:
     from bdgs_ros.data.layouts import open_sequence
 
-    return open_sequence(job.recording, job.camera_file, allow_truncated=job.allow_truncated)
+    sequence: Sequence = open_sequence(
+        job.recording, job.camera_file, allow_truncated=job.allow_truncated
+    )
+    truth = open_truth(job.recording)
+    if job.loop_frames is None:
+        return sequence, truth
+    loop = LoopedSequence(sequence, job.loop_frames)
+    return loop, None if truth is None else LoopedTruth(truth, loop)
 
 
 def choose_frames(available: int, start: int, count: int | None) -> range:

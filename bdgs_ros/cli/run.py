@@ -37,6 +37,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--start', type=int, default=0, metavar='N', help='first frame')
     parser.add_argument('--frames', type=int, metavar='N', help='number of frames')
     parser.add_argument(
+        '--loop-frames',
+        type=int,
+        metavar='N',
+        help='play the recording forth and back until it has N frames, to see how a long run goes',
+    )
+    parser.add_argument(
         '--allow-truncated', action='store_true', help='use what is readable of a cut-off bag'
     )
     parser.add_argument('--no-pictures', action='store_true', help='leave the pictures out')
@@ -70,6 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
         allow_truncated=arguments.allow_truncated,
         start=arguments.start,
         frames=arguments.frames,
+        loop_frames=arguments.loop_frames,
         pictures=not arguments.no_pictures,
         keyframes=not arguments.no_keyframes,
         map_file=arguments.map,

@@ -55,3 +55,18 @@ def test_ground_truth_and_truth_belong_to_the_frames():
 def test_what_cannot_be_looped_is_refused():
     with pytest.raises(DatasetError, match="'fake' with 1 frames cannot be looped to 9"):
         LoopedSequence(Stamped(1), 9)
+
+
+def test_a_run_can_be_looped(tmp_path):
+    from bdgs_ros.core.config import BdgsConfig, with_values
+    from bdgs_ros.data.synth import write_recording
+    from bdgs_ros.job import Job, run_job
+
+    write_recording(tmp_path / 'in', 'walking_xyz', 3, 8, size=(160, 120), jobs=1)
+    config = with_values(BdgsConfig(), {'mapping.iterations': 2, 'mapping.width': 80})
+    job = Job(tmp_path / 'in', tmp_path / 'out', config, loop_frames=20, pictures=False)
+    figures = {k: v['value'] for k, v in run_job(job)['metrics'].items()}
+    assert figures['frames_in'] == 20
+    assert figures['coverage'] == 100.0
+    assert figures['ate_rmse'] < 5
+    assert np.isfinite(figures['dynamic_recall'])  # there was a truth to every frame
