@@ -1,10 +1,10 @@
-# make install | demo | test | check | bench
+# make install | demo | test | check | bench | cuda-check (docs/cuda.md)
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: install demo test check bench clean
+.PHONY: install demo test check bench cuda-check clean
 
 install: $(STAMP)
 
@@ -27,6 +27,11 @@ check: install
 
 bench: install
 	$(BIN)/bdgs bench slam
+	$(BIN)/bdgs bench rasterizer
+
+cuda-check: install
+	BDGS_REQUIRE_CUDA=1 $(BIN)/python3 -m pytest test/unit/test_rasterize_gsplat.py \
+		test/unit/test_rasterize.py test/unit/test_detection_onnx.py
 	$(BIN)/bdgs bench rasterizer
 
 clean:

@@ -10,6 +10,7 @@ nothing is opaque. The limits leave room for CUDA's approximate exponential.
 from __future__ import annotations
 
 import logging
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -61,6 +62,8 @@ def gsplat(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> I
     """Return the backend's name, which stands for gsplat itself or for the stand-in."""
     reason = no_cuda()
     if request.param == 'cuda' and reason is not None:
+        if 'BDGS_REQUIRE_CUDA' in os.environ:  # `make cuda-check`
+            pytest.fail(reason)
         pytest.skip(reason)
     if request.param == 'stand-in':
         threads = torch.get_num_threads()
@@ -198,13 +201,13 @@ def test_each_loss_term_agrees_alone(gsplat: str, weights: LossWeights) -> None:
 
 @pytest.mark.parametrize('seed', range(3))
 def test_opaque_gaussians_differ_by_what_is_documented(gsplat: str, seed: int) -> None:
-    """Alpha is cut elsewhere and pixels end earlier; measured 0.025, on average 1.7e-4."""
+    """Alpha is cut elsewhere and pixels end earlier; measured 0.025, on average 4e-5."""
     g = make_gaussians(seed=seed, max_logit=99.0)
     g = replace(g, logit_opacities=2 * g.logit_opacities)
     ours = render(g, T_CAMERA_WORLD, CAMERA, backend=gsplat)
     twin = render(g, T_CAMERA_WORLD, CAMERA, backend='torch')
     apart = np.abs(ours.silhouette - twin.silhouette)
-    assert apart.max() < 0.1 and apart.mean() < 5e-4
+    assert apart.max() < 0.1 and apart.mean() < 2e-4
     given = make_derivatives(seed)
     a = backward(g, T_CAMERA_WORLD, CAMERA, *given, backend=gsplat)
     b = backward(g, T_CAMERA_WORLD, CAMERA, *given, backend='torch')
