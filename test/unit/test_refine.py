@@ -132,9 +132,9 @@ def test_the_result_is_a_complete_folder_that_can_be_refined_again(finished):
     assert metrics['metrics']['refine_iterations']['value'] == 60
     assert metrics['metrics_before'] == {}
     assert keyframe_folder(out / 'map.ply').is_dir()
-    again = refine_job(a_job(out, iterations=2))
-    first = metrics['metrics']['refine_loss_after']['value']
-    assert again['metrics']['refine_loss_before']['value'] == pytest.approx(first, rel=0.2)
+    again = refine_job(a_job(out, iterations=1))
+    first, second = metrics['metrics'], again['metrics']
+    assert second['refine_loss_before']['value'] < 0.8 * first['refine_loss_before']['value']
 
 
 def test_scores_are_of_frames_that_were_no_keyframes(finished):
