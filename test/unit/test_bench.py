@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from types import SimpleNamespace
 
 import numpy as np
@@ -38,6 +39,18 @@ class FakeBench:
         return {'total': sum(row['score'] for row in rows)}
 
 
+class IsolatedBench(FakeBench):
+    ISOLATED = True
+
+    def run_cell(self, cell, options):
+        if cell.sequence == 'b':
+            raise DatasetError('no such recording')
+        return {'process': os.getpid()}
+
+    def summarise(self, rows):
+        return {}
+
+
 @pytest.fixture
 def options(tmp_path):
     return Options(work=tmp_path / 'work', data=tmp_path)
@@ -52,6 +65,13 @@ def test_finished_cells_are_not_measured_again(options):
     assert second['rows'] == first['rows']
     run_bench(bench, options, force=True)
     assert len(bench.ran) == 8
+
+
+def test_isolated_cells_have_a_process_each_and_their_errors_arrive(options):
+    results = run_bench(IsolatedBench(), options, ['*/x/0'])
+    done, failed = results['rows']
+    assert done['process'] != os.getpid()
+    assert failed['error'] == 'no such recording'
 
 
 def test_other_settings_are_other_cells(options):
