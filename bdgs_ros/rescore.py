@@ -16,10 +16,10 @@ import numpy as np
 
 from bdgs_ros.core.config import BdgsConfig
 from bdgs_ros.core.errors import EvaluationError
+from bdgs_ros.core.files import write_text
 from bdgs_ros.core.types import Labels, RgbdFrame, TrackingResult, TrackingStatus, Trajectory
 from bdgs_ros.data.trajectory_io import read_trajectory
 from bdgs_ros.eval import scores
-from bdgs_ros.eval.files import write_text
 from bdgs_ros.eval.labels import LabelScore, score_labels
 from bdgs_ros.eval.metric import Metric, dump_json
 from bdgs_ros.eval.recorder import Recorder, RunResult

@@ -16,10 +16,10 @@ from typing import Any, Protocol
 
 from bdgs_ros.core.config import BdgsConfig, specs
 from bdgs_ros.core.errors import EvaluationError
+from bdgs_ros.core.files import write_text
 from bdgs_ros.core.types import RgbdFrame, TrackingResult, Trajectory
 from bdgs_ros.data.trajectory_io import write_trajectory
 from bdgs_ros.eval import pictures, plots, provenance, scores, trajectory
-from bdgs_ros.eval.files import write_text
 from bdgs_ros.eval.labels import LabelScore, score_labels
 from bdgs_ros.eval.metric import Metric, as_dict, dump_json
 from bdgs_ros.eval.recorder import Recorder, RunResult

@@ -25,8 +25,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from bdgs_ros.core.errors import BdgsError
+from bdgs_ros.core.files import write_text
 from bdgs_ros.eval import provenance
-from bdgs_ros.eval.files import write_text
 from bdgs_ros.eval.metric import dump_json, format_value, jsonable, markdown_table
 
 _LOGGER = logging.getLogger(__name__)

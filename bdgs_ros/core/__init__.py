@@ -1,1 +1,1 @@
-"""Types, geometry, configuration and errors: no ROS, no files, no clock."""
+"""Types, geometry, configuration, errors, writing aside: no ROS, no formats, no clock."""

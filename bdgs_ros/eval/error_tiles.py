@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bdgs_ros.core.errors import EvaluationError
+from bdgs_ros.core.files import write_aside
 from bdgs_ros.core.types import ColorImage
-from bdgs_ros.eval.files import write_aside
 from bdgs_ros.eval.scores import Truth, View
 
 _GAP_PX = 4

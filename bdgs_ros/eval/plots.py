@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bdgs_ros.core.files import write_aside
 from bdgs_ros.core.types import Trajectory
-from bdgs_ros.eval.files import write_aside
 from bdgs_ros.eval.trajectory import AteResult, transformed
 
 # A validated pair for colour-blind readers; truth is drawn in ink, dashed.

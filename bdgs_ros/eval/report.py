@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from bdgs_ros.eval.files import write_text
+from bdgs_ros.core.files import write_text
 from bdgs_ros.eval.metric import Metric, format_value
 
 _TYPES = {'.png': 'image/png', '.gif': 'image/gif', '.jpg': 'image/jpeg'}

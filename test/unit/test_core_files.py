@@ -6,7 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from bdgs_ros.core.files import previous_folder, write_bytes, write_folder_aside
+from bdgs_ros.core.files import (
+    previous_folder,
+    write_aside,
+    write_bytes,
+    write_folder_aside,
+    write_text,
+)
 
 
 def fill_with(text: str):
@@ -21,6 +27,29 @@ def test_parts_are_joined_and_nothing_is_left_beside(tmp_path):
     write_bytes(tmp_path / 'deep' / 'file.bin', b'ab', b'', b'c')
     assert (tmp_path / 'deep' / 'file.bin').read_bytes() == b'abc'
     assert names(tmp_path / 'deep') == ['file.bin']
+
+
+def test_folders_are_made_and_files_replaced(tmp_path):
+    path = tmp_path / 'a' / 'b.txt'
+    write_text(path, 'one')
+    write_text(path, 'two')
+    assert path.read_text() == 'two'
+    assert [p.name for p in path.parent.iterdir()] == ['b.txt']
+
+
+def test_the_old_file_survives_a_failed_write(tmp_path):
+    path = tmp_path / 'a.txt'
+    path.write_text('old')
+
+    def fail(aside):
+        assert aside.suffix == '.txt'
+        aside.write_text('half')
+        raise OSError('disk full')
+
+    with pytest.raises(OSError, match='disk full'):
+        write_aside(path, fail)
+    assert [p.name for p in tmp_path.iterdir()] == ['a.txt']
+    assert path.read_text() == 'old'
 
 
 def test_a_folder_replaces_an_older_one(tmp_path):
