@@ -195,13 +195,14 @@ def to_markdown(results: Mapping[str, Any]) -> str:
 
 
 def _tables(rows: list[dict[str, Any]], tables: Mapping[str, Sequence[str]]) -> str:
-    """Write all columns in one table, or those of each title for the rows that have any."""
+    """Write one table, or one for each title of the rows and columns that have anything in it."""
     if not tables:
         return markdown_table(rows)
     pages = []
     for title, columns in tables.items():
-        chosen = [r for r in rows if 'error' in r or any(r.get(c) is not None for c in columns)]
-        names = [*_IDENTITY, *columns, *(['error'] if any('error' in r for r in chosen) else [])]
+        measured = [c for c in columns if any(row.get(c) is not None for row in rows)]
+        chosen = [r for r in rows if 'error' in r or any(r.get(c) is not None for c in measured)]
+        names = [*_IDENTITY, *measured, *(['error'] if any('error' in r for r in chosen) else [])]
         if chosen:
             pages.append(f'## {title}\n\n{markdown_table(chosen, names)}')
     return '\n'.join(pages)

@@ -62,11 +62,11 @@ def _of_stages(*names: str) -> tuple[str, ...]:
 TABLES = {
     'Colour': _of_stages('psnr_db', 'psnr_fit_db', 'psnr_seen_db', 'ssim'),
     'Where it is hard': _of_stages('psnr_hidden_db', 'psnr_boxes_db', 'counted_percent', 'lpips'),
-    'Geometry': (*_of_stages('depth_l1_cm', 'seen_percent', 'views'), 'ate_rmse_cm'),
+    'Geometry': _of_stages('depth_l1_cm', 'seen_percent', 'views'),
     'Size and cost': (
         'gaussians', 'map_mb', 'refined_gaussians', 'refined_map_mb', 'refine_s',
         'refine_iterations', 'keyframes', 'mapping_ms', 'mapping_p95_ms', 'tracking_ms',
-        'peak_rss_mb',
+        'peak_rss_mb', 'ate_rmse_cm', 'coverage_percent',
     ),
     'Long runs': (
         'block_frames', 'block_mapping_ms', 'block_mapping_cpu_ms', 'block_tracking_ms',

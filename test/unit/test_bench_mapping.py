@@ -176,10 +176,11 @@ def test_tables_have_the_rows_that_have_their_columns():
             {'sequence': 'b', **row, 'blocks': [1.0, 2.5]},
             {'sequence': 'c', **row, 'error': 'no such recording'},
         ],
-        'tables': {'Quality': ['psnr'], 'Long': ['blocks']},
+        'tables': {'Quality': ['psnr', 'absent'], 'Long': ['blocks']},
     }  # fmt: skip
     quality, long = to_markdown(results).split('## Long')
     assert '| a | w | 0 | 20 | - |' in quality
     assert '| b |' not in quality
+    assert 'absent' not in quality
     assert '| b | w | 0 | 1 / 2.5 | - |' in long
     assert quality.count('no such recording') == long.count('no such recording') == 1
