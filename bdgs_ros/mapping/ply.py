@@ -72,8 +72,10 @@ def save_ply(path: Path, gaussians: GaussianMap, *, state: bool = True) -> None:
 
 def _header(count: int, properties: list[str]) -> bytes:
     lines = [f'property {text}\n' for text in properties]
-    start = f'ply\nformat binary_little_endian 1.0\nelement vertex {count}\n'
-    return (start + ''.join(lines) + 'end_header\n').encode('ascii')
+    # The comment tells viewers that know it (brush) which way is up: -y, as in all 3DGS maps.
+    start = 'ply\nformat binary_little_endian 1.0\ncomment Vertical axis: y\n'
+    count_line = f'element vertex {count}\n'
+    return (start + count_line + ''.join(lines) + 'end_header\n').encode('ascii')
 
 
 def _standard_blocks(gaussians: GaussianMap) -> list[Block]:
