@@ -67,14 +67,21 @@ constexpr int kOutputs = 16;  // floats per slot: 8 for g, 8 for w
 constexpr uint32_t kCulled = 0xffffffffu;
 constexpr int kRadixBits = 12, kRadix = 1 << kRadixBits;
 
-// alpha = exp2(l + a dx^2 + b dx dy + c dy^2), and what is blended with it.
-struct alignas(64) Record {
-  float u, v, a, b, c, l, red, green, blue, z, zeta_u, zeta_v, p_dynamic, unused[3];
-};
-
 struct Box {  // pixels, inclusive
   uint16_t x0, x1, y0, y1;
+
+  int tiles() const {
+    return (x1 / kTile - x0 / kTile + 1) * (y1 / kTile - y0 / kTile + 1);
+  }
 };
+
+// alpha = exp2(l + a dx^2 + b dx dy + c dy^2), and what is blended with it.
+struct alignas(64) Record {
+  float u, v, a, b, c, l, red, green, blue, z, zeta_u, zeta_v, p_dynamic;
+  Box box;
+  float unused;
+};
+static_assert(sizeof(Record) == 64, "one cache line");
 
 struct Entry {
   uint32_t key, id;
@@ -150,7 +157,7 @@ class Rasterizer {
 #pragma omp parallel for schedule(static) num_threads(threads)
     for (int group = 0; group < groups; ++group) project_group(in, view, group * kLanes, radius);
     sort_by_depth(in.count);
-    deal_to_tiles(in.count);
+    deal_to_tiles(in.count, threads);
   }
 
   void set_size(const View& view, int threads) {
@@ -161,7 +168,6 @@ class Rasterizer {
       tiles_x_ = (view.width + kTile - 1) / kTile;
       tiles_y_ = (view.height + kTile - 1) / kTile;
       tile_first_.reserve(tiles_x_ * tiles_y_ + 1);
-      tile_next_.reserve(tiles_x_ * tiles_y_);
       kept_.reserve(static_cast<size_t>(tiles_x_) * tiles_y_ * kBlocks);
     }
     if (arenas_.size() < static_cast<size_t>(threads)) {
@@ -236,9 +242,11 @@ class Rasterizer {
         continue;
       }
       keys_[id] = std::min<int32_t>(int32_t{key[lane]}, kRadix * kRadix - 1);
-      boxes_[id] = {static_cast<uint16_t>(first_x[lane]), static_cast<uint16_t>(final_x[lane]),
-                    static_cast<uint16_t>(first_y[lane]), static_cast<uint16_t>(final_y[lane])};
+      const Box box = {static_cast<uint16_t>(first_x[lane]), static_cast<uint16_t>(final_x[lane]),
+                       static_cast<uint16_t>(first_y[lane]), static_cast<uint16_t>(final_y[lane])};
+      boxes_[id] = box;
       Record& r = records_[id];
+      r.box = box;
       r.u = fields[0][lane];
       r.v = fields[1][lane];
       r.a = fields[2][lane];
@@ -281,37 +289,69 @@ class Rasterizer {
     for (size_t s = 0; s < visible_; ++s) entries[high[spare[s].key >> kRadixBits]++] = spare[s];
   }
 
-  void deal_to_tiles(int count) {
+  // Make the slots, tile by tile and near to far within a tile. Each thread deals a stretch of
+  // the sorted Gaussians and knows how many the stretches before its own put into each tile.
+  void deal_to_tiles(int count, int threads) {
     const int tiles = tiles_x_ * tiles_y_;
-    std::fill_n(tile_first_.data(), tiles + 1, 0u);
-    first_slot_.reserve(count);
-    slot_count_.reserve(count);
-    std::fill_n(slot_count_.data(), count, 0u);
-    for (size_t s = 0; s < visible_; ++s) {
-      const Box box = boxes_[entries_[s].id];
-      for (int ty = box.y0 / kTile; ty <= box.y1 / kTile; ++ty)
-        for (int tx = box.x0 / kTile; tx <= box.x1 / kTile; ++tx)
-          ++tile_first_[ty * tiles_x_ + tx + 1];
-    }
-    for (int t = 0; t < tiles; ++t) {
-      tile_first_[t + 1] += tile_first_[t];
-      tile_next_[t] = tile_first_[t];
-    }
-    slots_ = tile_first_[tiles];
+    number_slots(count);
     slot_gaussian_.reserve(slots_ + 16);
-    slots_of_.reserve(slots_);
+    slots_of_.reserve(slots_ + 1);
+    tile_next_.reserve(static_cast<size_t>(threads) * tiles);
+#pragma omp parallel num_threads(threads)
+    {
+      const int thread = omp_get_thread_num(), team = omp_get_num_threads();
+      const size_t begin = visible_ * thread / team, end = visible_ * (thread + 1) / team;
+      uint32_t* next = tile_next_.data() + static_cast<size_t>(thread) * tiles;
+      std::fill_n(next, tiles, 0u);
+      for_each_tile(begin, end, [&](uint32_t, int tile) { ++next[tile]; });
+#pragma omp barrier
+#pragma omp single
+      number_tiles(tiles, team);
+      for_each_tile(begin, end, [&](uint32_t id, int tile) {
+        const uint32_t slot = next[tile]++;
+        slot_gaussian_[slot] = id;
+        slots_of_[slot_next_[id]++] = slot;
+      });
+    }
+  }
+
+  // first_slot_[i] .. first_slot_[i + 1] are Gaussian i's places in slots_of_.
+  void number_slots(int count) {
+    first_slot_.reserve(count + 2 * kLanes + 1);
+    slot_next_.reserve(count + 1);
     uint32_t used = 0;
-    for (size_t s = 0; s < visible_; ++s) {
+    for (int i = 0; i < count; ++i) {
+      first_slot_[i] = slot_next_[i] = used;
+      used += keys_[i] == kCulled ? 0 : boxes_[i].tiles();
+    }
+    std::fill_n(first_slot_.data() + count, 2 * kLanes + 1, used);
+    slots_ = used;
+  }
+
+  // From counts per thread and tile to the first slot of each.
+  void number_tiles(int tiles, int team) {
+    uint32_t used = 0;
+    for (int tile = 0; tile < tiles; ++tile) {
+      tile_first_[tile] = used;
+      for (int thread = 0; thread < team; ++thread) {
+        uint32_t& next = tile_next_[static_cast<size_t>(thread) * tiles + tile];
+        const uint32_t here = next;
+        next = used;
+        used += here;
+      }
+    }
+    tile_first_[tiles] = used;
+  }
+
+  template <typename Visit>
+  void for_each_tile(size_t begin, size_t end, Visit visit) {
+    for (size_t s = begin; s < end; ++s) {
+      __builtin_prefetch(&boxes_[entries_[std::min(s + 16, end - 1)].id]);
       const uint32_t id = entries_[s].id;
       const Box box = boxes_[id];
-      first_slot_[id] = used;
       for (int ty = box.y0 / kTile; ty <= box.y1 / kTile; ++ty)
-        for (int tx = box.x0 / kTile; tx <= box.x1 / kTile; ++tx) {
-          const uint32_t slot = tile_next_[ty * tiles_x_ + tx]++;
-          slot_gaussian_[slot] = id;
-          slots_of_[used++] = slot;
-        }
-      slot_count_[id] = used - first_slot_[id];
+        for (int tx = box.x0 / kTile; tx <= box.x1 / kTile; ++tx)
+          visit(id, ty * tiles_x_ + tx);
     }
   }
 
@@ -349,10 +389,9 @@ class Rasterizer {
   void deal_to_blocks(int tile, int n, TileScratch& scratch, int* counts) {
     const int x0 = kTile * (tile % tiles_x_), y0 = kTile * (tile / tiles_x_);
     uint32_t* lists = scratch.lists.reserve(static_cast<size_t>(n) * kBlocks);
-    const uint32_t* ids = slot_gaussian_.data() + tile_first_[tile];
     std::fill_n(counts, kBlocks, 0);
     for (int j = 0; j < n; ++j) {
-      const Box box = boxes_[ids[j]];
+      const Box box = scratch.records[j].box;
       const int bx0 = std::max(box.x0 - x0, 0) / kBlockWidth;
       const int bx1 = std::min(box.x1 - x0, kTile - 1) / kBlockWidth;
       const int by0 = std::max(box.y0 - y0, 0) / kBlockHeight;
@@ -598,19 +637,17 @@ class Rasterizer {
   }
 
   // Sum the slots of Gaussians i .. i + kLanes - 1; false if none has any.
-  bool sum_slots(int count, int i, Moments& m) {
+  bool sum_slots(int i, Moments& m) {
     alignas(64) float sums[kLanes][kOutputs] = {};
-    uint32_t found = 0;
-    for (int lane = 0; lane < std::min(kLanes, count - i); ++lane) {
-      const uint32_t n = slot_count_[i + lane];
-      const uint32_t* slots = slots_of_.data() + (n > 0 ? first_slot_[i + lane] : 0);
-      found += n;
-      for (uint32_t s = 0; s < n; ++s) {
-        const float* from = &slot_sums_[static_cast<size_t>(slots[s]) * kOutputs];
+    // first_slot_ goes on beyond the last Gaussian
+    for (uint32_t s = first_slot_[i + kLanes]; s < first_slot_[i + 2 * kLanes]; ++s)
+      __builtin_prefetch(&slot_sums_[static_cast<size_t>(slots_of_[s]) * kOutputs]);
+    if (first_slot_[i] == first_slot_[i + kLanes]) return false;
+    for (int lane = 0; lane < kLanes; ++lane)
+      for (uint32_t s = first_slot_[i + lane]; s < first_slot_[i + lane + 1]; ++s) {
+        const float* from = &slot_sums_[static_cast<size_t>(slots_of_[s]) * kOutputs];
         for (int k = 0; k < kOutputs; ++k) sums[lane][k] += from[k];
       }
-    }
-    if (found == 0) return false;
     alignas(64) float columns[kOutputs][kLanes];
     for (int k = 0; k < kOutputs; ++k)
       for (int lane = 0; lane < kLanes; ++lane) columns[k][lane] = sums[lane][k];
@@ -632,15 +669,15 @@ class Rasterizer {
                     double* pose) {
     Moments m = {};
     ParameterGradients d = {};
-    if (sum_slots(in.count, i, m)) {
+    if (sum_slots(i, m)) {
       Ellipses e;
       transform_means(in, i, view, e);
       project(in, i, view, e);
       project_backward(e, view, m, d);
       // a Gaussian without slots may lie behind the camera: its lane holds rubbish
       Mask seen = {};
-      for (int lane = 0; lane < std::min(kLanes, in.count - i); ++lane)
-        seen[lane] = slot_count_[i + lane] > 0 ? -1 : 0;
+      for (int lane = 0; lane < kLanes; ++lane)
+        seen[lane] = first_slot_[i + lane] < first_slot_[i + lane + 1] ? -1 : 0;
       Lanes* all = reinterpret_cast<Lanes*>(&d);
       for (size_t k = 0; k < sizeof(d) / sizeof(Lanes); ++k) all[k] = seen ? all[k] : Lanes{};
       for (int k = 0; k < 6; ++k) pose[k] += sum(d.pose[k]);
@@ -657,9 +694,8 @@ class Rasterizer {
 #pragma omp parallel for schedule(static) num_threads(threads)
     for (int i = 0; i < count; ++i) {
       float total = 0, best = 0;
-      for (uint32_t s = 0; s < slot_count_[i]; ++s) {
-        const float* slot =
-            &slot_sums_[static_cast<size_t>(slots_of_[first_slot_[i] + s]) * kOutputs];
+      for (uint32_t s = first_slot_[i]; s < first_slot_[i + 1]; ++s) {
+        const float* slot = &slot_sums_[static_cast<size_t>(slots_of_[s]) * kOutputs];
         total += slot[0];
         best = std::max(best, slot[1]);
       }
@@ -676,7 +712,7 @@ class Rasterizer {
   Buffer<Record> records_;
   Buffer<Box> boxes_;
   Buffer<uint32_t> keys_, tile_first_, tile_next_, slot_gaussian_;
-  Buffer<uint32_t> first_slot_, slot_count_, slots_of_;  // per Gaussian, into slots_of_
+  Buffer<uint32_t> first_slot_, slot_next_, slots_of_;  // see number_slots
   Buffer<Entry> entries_, spare_;
   Buffer<Kept> kept_;
   std::vector<uint32_t> low_, high_;
@@ -800,7 +836,7 @@ py::tuple fused_step(Rasterizer& r, const py::tuple& gaussians, const py::object
                      int height, const std::array<double, 4>& intrinsics,
                      const std::array<double, 16>& pose, int threads, const Floats& target_color,
                      const Floats& target_depth, const Floats& pixel_weight,
-                     const std::array<float, 4>& weights, const std::array<float, 2>& exposure,
+                     const std::array<float, 5>& weights, const std::array<float, 2>& exposure,
                      const py::tuple& gradients, const py::object& images) {
   const Parameters in = parameters_of(gaussians, active);
   const View view = view_of(width, height, intrinsics, pose);
@@ -808,7 +844,8 @@ py::tuple fused_step(Rasterizer& r, const py::tuple& gaussians, const py::object
   const GradientArrays out = gradients_of(gradients, d_pose);
   const LossInput loss_in{target_color.data(), target_depth.data(), pixel_weight.data(),
                           weights[0],          weights[1],          weights[2],
-                          weights[3],          exposure[0],         exposure[1]};
+                          weights[3],          weights[4],          exposure[0],
+                          exposure[1]};
   LossResult loss;
   {
     py::gil_scoped_release release;
@@ -817,8 +854,8 @@ py::tuple fused_step(Rasterizer& r, const py::tuple& gaussians, const py::object
     r.backward(in, view, threads, out);
   }
   if (!images.is_none()) copy_rendered(r, images, threads);
-  return py::make_tuple(loss.total, loss.l1, loss.ssim, loss.depth, loss.smooth, loss.d_log_gain,
-                        loss.d_offset, d_pose);
+  return py::make_tuple(loss.total, loss.l1, loss.ssim, loss.depth, loss.smooth, loss.empty,
+                        loss.d_log_gain, loss.d_offset, d_pose);
 }
 
 // Whether this processor (and its kernel) can run the build `name`.

@@ -2,15 +2,16 @@
 //
 //   I   = exp(log_gain) C + offset                        exposure of the target, C rendered
 //   E   = sum_p w_p [ l1 |I - T|_p + ssim (1 - SSIM_p) ] / sum_p w_p
-//       + depth  sum_{p: D_p > 0} w_p |Z - S D|_p / sum_{p: D_p > 0} w_p
+//       + sum_{p: D_p > 0} w_p (depth |S| |Z / S - D|_p + empty (1 - S_p)) / sum_{p: D_p > 0} w_p
 //       + smooth sum_p w_p (e_p^h r_p^h + e_p^v r_p^v) / sum_p w_p
 //
-// |.| and SSIM are means over the three channels. Z = sum of weights times depth and S = silhouette,
-// so Z - S D = sum of weights times (z - D): it needs no division by S, is zero where nothing was
-// drawn, and pulls each Gaussian by its own weight. (Z / S - D instead grows without bound at the
-// rim of the map, where S goes to 0.)
+// |.| and SSIM are means over the three channels. Z = sum of weights times depth and S = silhouette;
+// Z / S is the depth that the map shows. The factor |S| is not differentiated: it lets what hardly
+// shows pull hardly, where Z / S - D alone would pull without bound at the rim of the map; and if it
+// were differentiated, a depth that is off would be cured by making the surface transparent. The
+// last term wants the map opaque wherever the camera measured a surface.
 //
-// The last term is the edge-aware smoothness that stands for the image-gradient term of Eq. 8, after
+// The `smooth` term is the edge-aware smoothness that stands for the image-gradient term of Eq. 8, after
 // `depth_reg` of MonoGS (Matsuki et al., 2024): there e |dZ| with e = exp(-10 |grad T|^2). A first
 // difference would turn every wall towards the camera, so here r compares a pixel's mean depth z = Z/S
 // with that of the line through its two neighbours, along the row (h) and the column (v):
@@ -23,10 +24,18 @@
 // object hides is in nobody's statistics. With n, mx, my, s, c the windowed sums of 1, x, y,
 // x^2 + y^2 and x y over those pixels, SSIM is a function f(mx/n, s/n, c/n), and the gradient with
 // respect to x is three more windows: blur(f_m/n) + 2 x blur(f_s/n) + y blur(f_c/n).
+//
+// The windows are separable, and run down the image in one sweep. A row's 13 planes (mask, x, y,
+// x^2 + y^2, x y) are blurred along the row while they are in the nearest cache and go to a ring of
+// 16 rows; four rows at a time are blurred down the ring, become SSIM and its three fields f/n, and
+// those go through a second ring in the same way. Planes of the whole image would not fit the cache.
 
 #pragma once
 
 #include <algorithm>
+#include <vector>
+
+#include <omp.h>
 
 #include "rasterizer_simd.hpp"
 
@@ -50,20 +59,21 @@ struct Layout {
 enum Plane {
   kRed, kGreen, kBlue, kDepth, kSilhouette, kDynamic,  // rendered
   kGradRed, kGradGreen, kGradBlue, kGradDepth, kGradSilhouette,
-  kWeight, kMask,           // w and w > 0
-  kMean, kBendH, kBendV,    // z where it counts, else 0; dL/dz by the middle pixel of r^h and r^v
-  kX, kY = kX + 3, kS = kY + 3, kC = kS + 3,
-  kField = kC + 3,          // f_m/n, f_s/n, f_c/n of three channels
-  kPlanes = kField + 9
+  kWeight, kTargetDepth,    // w, and D where it is known, else 0
+  kTarget,                  // T where w > 0, else 0; three channels
+  kMean = kTarget + 3,      // z where it counts, else 0
+  kBendH, kBendV,           // dL/dz by the middle pixel of r^h and r^v
+  kPlanes
 };
 
 struct LossInput {
   const float *color, *depth, *weight;  // target: [H, W, 3], [H, W], [H, W]
-  float l1, ssim, depth_weight, smooth, log_gain, offset;
+  float l1, ssim, depth_weight, smooth, empty, log_gain, offset;
 };
 
 struct LossResult {
-  double total = 0, l1 = 0, ssim = 0, depth = 0, smooth = 0, d_log_gain = 0, d_offset = 0;
+  double total = 0, l1 = 0, ssim = 0, depth = 0, smooth = 0, empty = 0, d_log_gain = 0;
+  double d_offset = 0;
 };
 
 class Loss {
@@ -76,28 +86,28 @@ class Loss {
     in_ = in;
     gain_ = std::exp(in.log_gain);
     rows_.reserve(layout.height);
+    if (sweeps_.size() < static_cast<size_t>(threads)) sweeps_.resize(threads);
     fill_window();
     const int height = layout.height;
 #pragma omp parallel num_threads(threads)
     {
 #pragma omp for schedule(static)
-      for (int y = 0; y < height; ++y) count_row(y);
+      for (int y = 0; y < height; ++y) read_row(y);
 #pragma omp single
       set_scales();
-#pragma omp for schedule(static)
-      for (int y = 0; y < height; ++y) pixel_row(y);
-      if (in_.ssim > 0) {
-#pragma omp for schedule(static)
-        for (int y = 0; y < height; ++y) ssim_row(y);
-      }
+      const int thread = omp_get_thread_num(), team = omp_get_num_threads();
+      const int begin = height * thread / team, end = height * (thread + 1) / team;
+      if (in_.ssim > 0)
+        sweep(begin, end, sweeps_[thread]);
+      else
+        for (int y = begin; y < end; ++y) finish_row(y);
       if (in_.smooth > 0) {
+#pragma omp barrier
 #pragma omp for schedule(static)
         for (int y = 0; y < height; ++y) bend_row(y);
 #pragma omp for schedule(static)
         for (int y = 0; y < height; ++y) smooth_row(y);
       }
-#pragma omp for schedule(static)
-      for (int y = 0; y < height; ++y) finish_row(y);
     }
     return total();
   }
@@ -105,11 +115,22 @@ class Loss {
  private:
   static constexpr int kRadius = 5;
   static constexpr float kFar = 1e30f;  // infinite depth is no depth
-  static constexpr float kEdge = 10.0f;
   static constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;
+  static constexpr float kEdge = 10.0f;
+  static constexpr int kWindowed = 13, kFields = 9;  // planes in the two rings
+  static constexpr int kRing = 16, kQuad = 4;        // rows
 
   struct Row {
-    double weight, depth_weight, l1, ssim, depth, smooth, d_log_gain, d_offset;
+    double weight, depth_weight, l1, ssim, depth, smooth, empty, d_log_gain, d_offset;
+  };
+
+  struct RowSums {
+    Lanes l1, depth, empty, d_log_gain, d_offset;
+  };
+
+  // A thread's rings, and the row that it is blurring.
+  struct Sweep {
+    Buffer<float> row, windowed, fields;
   };
 
   float* plane(int which, int y) { return planes_ + which * layout_.plane + layout_.at(y, 0); }
@@ -121,20 +142,32 @@ class Loss {
       window_[d] = static_cast<float>(std::exp(-d * d / 4.5) / sum);
   }
 
-  static bool usable(float depth) { return depth > 0.0f && depth < kFar; }
-
-  void count_row(int y) {
-    Row& row = rows_[y] = Row{};
-    const float* weight = in_.weight + static_cast<size_t>(y) * layout_.width;
-    const float* depth = in_.depth + static_cast<size_t>(y) * layout_.width;
-    float sum = 0, sum_depth = 0;
-    for (int x = 0; x < layout_.width; ++x) {
-      const float w = weight[x] > 0.0f ? weight[x] : 0.0f;
-      sum += w;
-      sum_depth += usable(depth[x]) ? w : 0.0f;
+  // Target and weight become planes. These are zero beyond the image, so whole vectors may overhang.
+  void read_row(int y) {
+    const int width = layout_.width;
+    const float* weight = in_.weight + static_cast<size_t>(y) * width;
+    const float* pixels = in_.color + static_cast<size_t>(y) * width * 3;
+    float *w = plane(kWeight, y), *depth = plane(kTargetDepth, y);
+    float *red = plane(kTarget, y), *green = plane(kTarget + 1, y), *blue = plane(kTarget + 2, y);
+    for (int x = 0; x < width; ++x) w[x] = weight[x] > 0.0f ? weight[x] : 0.0f;
+    std::memcpy(depth, in_.depth + static_cast<size_t>(y) * width, width * sizeof(float));
+    for (int x = 0; x < width; ++x) {
+      const bool counts = weight[x] > 0.0f;
+      red[x] = counts ? pixels[3 * x] : 0.0f;
+      green[x] = counts ? pixels[3 * x + 1] : 0.0f;
+      blue[x] = counts ? pixels[3 * x + 2] : 0.0f;
     }
-    row.weight = sum;
-    row.depth_weight = sum_depth;
+    Lanes sum_w = Lanes{}, sum_depth = Lanes{};
+    for (int x = 0; x < width; x += kLanes) {
+      const Lanes weights = load(w + x), d = load(depth + x), zero = Lanes{};
+      const Mask known = (d > 0.0f) & (d < kFar) & (weights > 0.0f);
+      store(depth + x, known ? d : zero);
+      sum_w += weights;
+      sum_depth += known ? weights : zero;
+    }
+    rows_[y] = Row{};
+    rows_[y].weight = sum(sum_w);
+    rows_[y].depth_weight = sum(sum_depth);
   }
 
   void set_scales() {
@@ -151,68 +184,204 @@ class Loss {
     return v > 0.0f ? splat(1.0f) : (v < 0.0f ? splat(-1.0f) : Lanes{});
   }
 
-  // L1 and depth terms, and the planes that SSIM windows run over. Planes are zero beyond the
-  // image, and `w` too, so whole vectors may overhang.
-  void pixel_row(int y) {
-    static thread_local Buffer<float> memory;
-    const int width = layout_.width;
+  // ---- SSIM ------------------------------------------------------------------------------------
+
+  // Rows begin .. end - 1, with what they need of the rows around. Beyond the image all is zero.
+  void sweep(int begin, int end, Sweep& s) {
     const size_t length = layout_.stride;
-    float* target = memory.reserve(4 * length);
-    float* depth = target + 3 * length;
-    std::memcpy(depth, in_.depth + static_cast<size_t>(y) * width, width * sizeof(float));
-    const float* weight = in_.weight + static_cast<size_t>(y) * width;
-    const float* pixels = in_.color + static_cast<size_t>(y) * width * 3;
-    float* w = plane(kWeight, y);
-    for (int x = 0; x < width; ++x) w[x] = weight[x] > 0.0f ? weight[x] : 0.0f;
-    for (int x = 0; x < width; ++x)
-      for (int c = 0; c < 3; ++c) target[c * length + x] = pixels[3 * x + c];
-    Lanes l1 = Lanes{}, depth_error = Lanes{};
-    for (int x = 0; x < width; x += kLanes) {
-      l1 += color_lanes(y, x, target, length);
-      depth_error += depth_lanes(y, x, load(depth + x));
+    s.row.reserve(kQuad * kWindowed * length);
+    s.windowed.reserve(kRing * kWindowed * length);
+    s.fields.reserve(kRing * kFields * length);
+    int next = begin - 2 * kRadius;
+    for (int y = begin - kRadius; y < end + kRadius; y += kQuad) {
+      for (; next < y + kQuad + kRadius; ++next) window_row(next, s);
+      ssim_rows(y, begin, end, s);
+      finish_rows(y - kRadius, begin, end, s);
     }
-    rows_[y].l1 = sum(l1) / 3.0;
-    rows_[y].depth = sum(depth_error);
   }
 
-  Lanes color_lanes(int y, int x, const float* target, size_t length) {
-    const Lanes w = load(plane(kWeight, y) + x), zero = Lanes{};
-    const Mask counts = w > 0.0f;
-    store(plane(kMask, y) + x, counts ? splat(1.0f) : zero);
-    const float scale = in_.l1 * per_weight_ / 3.0f;
-    Lanes loss = zero;
+  // Blur kCount planes of a row along it; `in` has kBorder zeros on both sides of each.
+  template <int kCount>
+  void blur_along(const float* in, float* out) const {
+    const size_t length = layout_.stride;
+    for (int k = 0; k < kCount; ++k, in += length, out += length)
+      for (int x = 0; x < layout_.width; x += kLanes) {
+        const float* at = in + Layout::kBorder + x;
+        Lanes sum = window_[0] * load(at);
+        for (int d = 1; d <= kRadius; ++d) sum += window_[d] * (load(at - d) + load(at + d));
+        store(out + x, sum);
+      }
+  }
+
+  // Blur rows y .. y + 3 of plane k down a ring, at column x.
+  template <int kCount>
+  void blur_down(const float* const* rows, int k, int x, Lanes (*out)[kCount]) const {
+    const size_t at = k * layout_.stride + x;
+    Lanes sums[kQuad] = {};
+#pragma GCC unroll 16
+    for (int from = 0; from < kQuad + 2 * kRadius; ++from) {
+      const Lanes v = load(rows[from] + at);
+#pragma GCC unroll 4
+      for (int q = 0; q < kQuad; ++q) {
+        const int d = from - kRadius - q;
+        if (d >= -kRadius && d <= kRadius) sums[q] += window_[d < 0 ? -d : d] * v;
+      }
+    }
+    for (int q = 0; q < kQuad; ++q) out[q][k] = sums[q];
+  }
+
+  template <int kCount>
+  void ring_rows(const float* ring, int y, const float** rows) const {
+    for (int from = 0; from < kQuad + 2 * kRadius; ++from)
+      rows[from] = ring + ((y - kRadius + from) & (kRing - 1)) * kCount * layout_.stride;
+  }
+
+  template <int kCount>
+  void clear_borders(float* row) const {
+    const size_t length = layout_.stride;
+    const int last = (layout_.width + kLanes - 1) / kLanes * kLanes;
+    for (int k = 0; k < kCount; ++k, row += length)
+      for (int x = 0; x < Layout::kBorder; ++x) {
+        row[x] = 0.0f;
+        row[Layout::kBorder + last + x] = 0.0f;
+      }
+  }
+
+  // Mask, x, y, x^2 + y^2 and x y of a row, blurred along it.
+  void window_row(int y, Sweep& s) {
+    const size_t length = layout_.stride;
+    float* row = s.row.data() + Layout::kBorder;
+    for (int x = 0; x < layout_.width; x += kLanes) {
+      const Mask counts = load(plane(kWeight, y) + x) > 0.0f;
+      store(row + x, counts ? splat(1.0f) : Lanes{});
+      for (int c = 0; c < 3; ++c) {
+        const Lanes v =
+            counts ? gain_ * load(plane(kRed + c, y) + x) + in_.offset : Lanes{};
+        const Lanes t = load(plane(kTarget + c, y) + x);
+        store(row + (1 + c) * length + x, v);
+        store(row + (4 + c) * length + x, t);
+        store(row + (7 + c) * length + x, v * v + t * t);
+        store(row + (10 + c) * length + x, v * t);
+      }
+    }
+    clear_borders<kWindowed>(s.row.data());
+    float* to = s.windowed.data() + (y & (kRing - 1)) * kWindowed * length;
+    blur_along<kWindowed>(s.row.data(), to);
+  }
+
+  // SSIM of rows y .. y + 3 and its fields, blurred along the rows.
+  void ssim_rows(int y, int begin, int end, Sweep& s) {
+    const size_t length = layout_.stride;
+    const float* rows[kQuad + 2 * kRadius];
+    ring_rows<kWindowed>(s.windowed.data(), y, rows);
+    Lanes loss[kQuad] = {};
+    for (int x = 0; x < layout_.width; x += kLanes) {
+      Lanes blurred[kQuad][kWindowed];
+      for (int k = 0; k < kWindowed; ++k) blur_down<kWindowed>(rows, k, x, blurred);
+      for (int q = 0; q < kQuad; ++q)
+        loss[q] += ssim_lanes(load(plane(kWeight, y + q) + x), blurred[q],
+                              s.row.data() + q * kFields * length + Layout::kBorder + x);
+    }
+    for (int q = 0; q < kQuad; ++q) {
+      float* row = s.row.data() + q * kFields * length;
+      clear_borders<kFields>(row);
+      blur_along<kFields>(row, s.fields.data() + ((y + q) & (kRing - 1)) * kFields * length);
+      if (y + q >= begin && y + q < end) rows_[y + q].ssim = sum(loss[q]) / 3.0;
+    }
+  }
+
+  // w (1 - SSIM), from windowed sums of mask, x, y, x^2 + y^2, x y; stores the fields.
+  Lanes ssim_lanes(Lanes w, const Lanes* in, float* fields) const {
+    const size_t length = layout_.stride;
+    const float scale = in_.ssim * per_weight_ / 3.0f;
+    const Lanes per_n = 1.0f / max(in[0], splat(1e-6f));
+    Lanes loss = Lanes{};
     for (int c = 0; c < 3; ++c) {
-      const Lanes rendered = load(plane(kRed + c, y) + x);
-      const Lanes v = counts ? gain_ * rendered + in_.offset : zero;
-      const Lanes t = counts ? load(target + c * length + x) : zero;
-      store(plane(kX + c, y) + x, v);
-      store(plane(kY + c, y) + x, t);
-      store(plane(kS + c, y) + x, v * v + t * t);
-      store(plane(kC + c, y) + x, v * t);
-      store(plane(kGradRed + c, y) + x, scale * w * sign(v - t));
-      loss += w * abs(v - t);
+      const Lanes mx = per_n * in[1 + c], my = per_n * in[4 + c];
+      const Lanes ss = per_n * in[7 + c], cc = per_n * in[10 + c];
+      const Lanes a1 = 2.0f * mx * my + kC1, a2 = 2.0f * (cc - mx * my) + kC2;
+      const Lanes mm = mx * mx + my * my;
+      const Lanes b1 = mm + kC1, b2 = max(ss - mm, Lanes{}) + kC2;
+      const Lanes per_b1 = 1.0f / b1, per_b2 = 1.0f / b2, per_b = per_b1 * per_b2;
+      const Lanes f = a1 * a2 * per_b;
+      const Lanes g = -scale * w * per_n;
+      const Lanes f_m = 2.0f * (my * (a2 - a1) * per_b + mx * f * (per_b2 - per_b1));
+      store(fields + c * length, g * f_m);
+      store(fields + (3 + c) * length, -g * f * per_b2);
+      store(fields + (6 + c) * length, 2.0f * g * a1 * per_b);
+      loss += w * (1.0f - f);
     }
     return loss;
   }
 
-  Lanes depth_lanes(int y, int x, Lanes depth) {
-    const Lanes zero = Lanes{};
+  // ---- gradients by the rendered planes --------------------------------------------------------
+
+  void finish_rows(int y, int begin, int end, Sweep& s) {
+    if (y + kQuad <= begin || y >= end) return;
+    const float* rows[kQuad + 2 * kRadius];
+    ring_rows<kFields>(s.fields.data(), y, rows);
+    const int first = std::max(begin - y, 0), last = std::min(end - y, kQuad);
+    RowSums sums[kQuad] = {};
+    for (int x = 0; x < layout_.width; x += kLanes) {
+      Lanes blurred[kQuad][kFields];
+      for (int k = 0; k < kFields; ++k) blur_down<kFields>(rows, k, x, blurred);
+      for (int q = first; q < last; ++q) finish_lanes(y + q, x, blurred[q], sums[q]);
+    }
+    for (int q = first; q < last; ++q) store_sums(y + q, sums[q]);
+  }
+
+  void finish_row(int y) {
+    RowSums sums = {};
+    const Lanes none[kFields] = {};
+    for (int x = 0; x < layout_.width; x += kLanes) finish_lanes(y, x, none, sums);
+    store_sums(y, sums);
+  }
+
+  void store_sums(int y, const RowSums& sums) {
+    rows_[y].l1 = sum(sums.l1) / 3.0;
+    rows_[y].depth = sum(sums.depth);
+    rows_[y].empty = sum(sums.empty);
+    rows_[y].d_log_gain = sum(sums.d_log_gain);
+    rows_[y].d_offset = sum(sums.d_offset);
+  }
+
+  // L1, what the blurred fields give for SSIM, both through the exposure; and the depth term.
+  void finish_lanes(int y, int x, const Lanes* fields, RowSums& sums) {
     const Lanes w = load(plane(kWeight, y) + x);
-    const Mask known = (depth > 0.0f) & (depth < kFar) & (w > 0.0f);
-    const Lanes d = known ? depth : zero, use = known ? w : zero;
-    const Lanes error = known ? load(plane(kDepth, y) + x) - load(plane(kSilhouette, y) + x) * d
-                              : zero;
+    const Mask counts = w > 0.0f;
+    const Lanes zero = Lanes{};
+    const float scale = in_.l1 * per_weight_ / 3.0f;
+    for (int c = 0; c < 3; ++c) {
+      const Lanes rendered = gain_ * load(plane(kRed + c, y) + x);
+      const Lanes v = rendered + in_.offset, t = load(plane(kTarget + c, y) + x);
+      const Lanes by_ssim = fields[c] + 2.0f * v * fields[3 + c] + t * fields[6 + c];
+      const Lanes g = counts ? scale * w * sign(v - t) + by_ssim : zero;
+      sums.l1 += w * abs(v - t);
+      sums.d_offset += g;
+      sums.d_log_gain += g * rendered;
+      store(plane(kGradRed + c, y) + x, g * gain_);
+    }
+    depth_lanes(y, x, w, sums);
+  }
+
+  void depth_lanes(int y, int x, Lanes w, RowSums& sums) {
+    const Lanes zero = Lanes{}, d = load(plane(kTargetDepth, y) + x);
+    const Lanes z = load(plane(kDepth, y) + x), silhouette = load(plane(kSilhouette, y) + x);
+    const Lanes use = d > 0.0f ? w : zero, error = z - silhouette * d;
     const Lanes by_depth = (in_.depth_weight * per_depth_) * use * sign(error);
     store(plane(kGradDepth, y) + x, by_depth);
-    store(plane(kGradSilhouette, y) + x, -by_depth * d);
+    store(plane(kGradSilhouette, y) + x,
+          -by_depth * z / max(silhouette, splat(1e-6f)) - (in_.empty * per_depth_) * use);
     if (in_.smooth > 0) {
-      const Lanes silhouette = load(plane(kSilhouette, y) + x);
       const Mask counts = (silhouette > 0.5f) & (w > 0.0f);
-      const Lanes z = load(plane(kDepth, y) + x) / max(silhouette, splat(0.5f));
-      store(plane(kMean, y) + x, counts ? max(z, zero) : zero);
+      const Lanes mean = z / max(silhouette, splat(0.5f));
+      store(plane(kMean, y) + x, counts ? max(mean, zero) : zero);
     }
-    return use * abs(error);
+    sums.depth += use * abs(error);
+    sums.empty += use * (1.0f - silhouette);
   }
+
+  // ---- smoothness ------------------------------------------------------------------------------
 
   // w e r of the triple around (x, y) along `step`, and its derivative by the middle depth.
   Lanes bend(int y, int x, ptrdiff_t step, Lanes* slope) {
@@ -221,7 +390,7 @@ class Loss {
     const Mask counts = (before > 0.0f) & (middle > 0.0f) & (after > 0.0f);
     Lanes edge = Lanes{};
     for (int c = 0; c < 3; ++c) {
-      const float* t = plane(kY + c, y) + x;
+      const float* t = plane(kTarget + c, y) + x;
       const Lanes one = load(t) - load(t - step), other = load(t) - load(t + step);
       edge += one * one + other * other;
     }
@@ -265,97 +434,19 @@ class Loss {
     }
   }
 
-  // Vertical half of the window for row y; `out` also covers the border that the other half needs.
-  void blur_columns(const float* in, float* out) const {
-    const ptrdiff_t stride = static_cast<ptrdiff_t>(layout_.stride);
-    for (int x = -Layout::kBorder; x < layout_.width + kRadius; x += kLanes) {
-      Lanes sum = window_[0] * load(in + x);
-      for (int d = 1; d <= kRadius; ++d)
-        sum += window_[d] * (load(in + x - d * stride) + load(in + x + d * stride));
-      store(out + Layout::kBorder + x, sum);
-    }
-  }
-
-  Lanes blur_row(const float* columns, int x) const {
-    const float* at = columns + Layout::kBorder + x;
-    Lanes sum = window_[0] * load(at);
-    for (int d = 1; d <= kRadius; ++d) sum += window_[d] * (load(at - d) + load(at + d));
-    return sum;
-  }
-
-  void ssim_row(int y) {
-    static thread_local Buffer<float> memory;
-    const size_t length = layout_.stride + 2 * kLanes;
-    float* columns = memory.reserve(13 * length);
-    blur_columns(plane(kMask, y), columns);
-    for (int k = 0; k < 12; ++k) blur_columns(plane(kX + k, y), columns + (1 + k) * length);
-    const float* weight = plane(kWeight, y);
-    const float scale = in_.ssim * per_weight_ / 3.0f;
-    Lanes loss = Lanes{};
-    for (int x = 0; x < layout_.width; x += kLanes) {
-      const Lanes w = load(weight + x);
-      const Lanes per_n = 1.0f / max(blur_row(columns, x), splat(1e-6f));
-      for (int c = 0; c < 3; ++c) {
-        const Lanes mx = per_n * blur_row(columns + (1 + c) * length, x);
-        const Lanes my = per_n * blur_row(columns + (4 + c) * length, x);
-        const Lanes ss = per_n * blur_row(columns + (7 + c) * length, x);
-        const Lanes cc = per_n * blur_row(columns + (10 + c) * length, x);
-        const Lanes a1 = 2.0f * mx * my + kC1, a2 = 2.0f * (cc - mx * my) + kC2;
-        const Lanes mm = mx * mx + my * my;
-        const Lanes b1 = mm + kC1, b2 = max(ss - mm, Lanes{}) + kC2;
-        const Lanes per_b1 = 1.0f / b1, per_b2 = 1.0f / b2, per_b = per_b1 * per_b2;
-        const Lanes f = a1 * a2 * per_b;
-        const Lanes g = -scale * w * per_n;
-        const Lanes f_m = 2.0f * (my * (a2 - a1) * per_b + mx * f * (per_b2 - per_b1));
-        store(plane(kField + c, y) + x, g * f_m);
-        store(plane(kField + 3 + c, y) + x, -g * f * per_b2);
-        store(plane(kField + 6 + c, y) + x, 2.0f * g * a1 * per_b);
-        loss += w * (1.0f - f);
-      }
-    }
-    rows_[y].ssim = sum(loss) / 3.0;
-  }
-
-  // Add the gradient of SSIM, and go through the exposure.
-  void finish_row(int y) {
-    static thread_local Buffer<float> memory;
-    const size_t length = layout_.stride + 2 * kLanes;
-    float* columns = memory.reserve(9 * length);
-    const bool ssim = in_.ssim > 0;
-    for (int k = 0; ssim && k < 9; ++k) blur_columns(plane(kField + k, y), columns + k * length);
-    const float* mask = plane(kMask, y);
-    Lanes d_offset = Lanes{}, d_log_gain = Lanes{};
-    for (int c = 0; c < 3; ++c) {
-      const float *px = plane(kX + c, y), *py = plane(kY + c, y);
-      float* grad = plane(kGradRed + c, y);
-      for (int i = 0; i < layout_.width; i += kLanes) {
-        const Lanes x = load(px + i);
-        Lanes g = load(grad + i);
-        if (ssim)
-          g += load(mask + i) * (blur_row(columns + c * length, i) +
-                                 2.0f * x * blur_row(columns + (3 + c) * length, i) +
-                                 load(py + i) * blur_row(columns + (6 + c) * length, i));
-        d_offset += g;
-        d_log_gain += g * (x - in_.offset);
-        store(grad + i, g * gain_);
-      }
-    }
-    rows_[y].d_offset = sum(d_offset);
-    rows_[y].d_log_gain = sum(d_log_gain);
-  }
-
   LossResult total() const {
     LossResult out;
     for (int y = 0; y < layout_.height; ++y) {
       out.l1 += rows_[y].l1 * per_weight_;
       out.ssim += rows_[y].ssim * per_weight_;
       out.depth += rows_[y].depth * per_depth_;
+      out.empty += rows_[y].empty * per_depth_;
       out.smooth += rows_[y].smooth * per_weight_;
       out.d_log_gain += rows_[y].d_log_gain;
       out.d_offset += rows_[y].d_offset;
     }
     out.total = in_.l1 * out.l1 + in_.ssim * out.ssim + in_.depth_weight * out.depth +
-                in_.smooth * out.smooth;
+                in_.smooth * out.smooth + in_.empty * out.empty;
     return out;
   }
 
@@ -365,6 +456,7 @@ class Loss {
   float gain_ = 1, per_weight_ = 0, per_depth_ = 0;
   float window_[kRadius + 1] = {};
   Buffer<Row> rows_;
+  std::vector<Sweep> sweeps_;
 };
 
 }  // namespace bdgs

@@ -225,10 +225,11 @@ def fused_step(
 
     The colour term is Eq. 9 between `exp(log_gain) * color + offset` and the target. SSIM windows
     are cut to the pixels with weight > 0 and normalised over them. The depth term is
-    |depth - silhouette * D|, which needs no division: depth / silhouette - D would grow without
-    bound where the silhouette goes to 0. Both are means weighted by `pixel_weight`, and so is the
-    smoothness term, the first of Eq. 8: how far depth / silhouette is from locally plane, off the
-    target's edges.
+    silhouette * |depth / silhouette - D| with a first factor that is not differentiated: what
+    hardly shows pulls hardly, and a wrong depth does not make a surface transparent. Beside it, a
+    term wants the silhouette 1 where D is known. All are means weighted by `pixel_weight`, and so
+    is the smoothness term, the first of Eq. 8: how far depth / silhouette is from locally plane,
+    off the target's edges.
 
     Parameters
     ----------

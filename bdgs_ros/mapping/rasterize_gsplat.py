@@ -139,7 +139,7 @@ class GsplatBackend:
             with torch.device(self._device):  # the constants that `image_loss` makes
                 terms = image_loss(images, exposure, target, weights)
             torch.autograd.backward([terms.total, view.visibility_image.sum()])
-        loss, l1, ssim, depth, smooth = torch.stack(terms).detach().tolist()
+        loss, l1, ssim, depth, smooth, empty = torch.stack(terms).detach().tolist()
         assert exposure.grad is not None
         return FusedResult(
             loss=loss,
@@ -151,6 +151,7 @@ class GsplatBackend:
             visibility=view.visibility(),
             rendered=_rendered(images) if with_images else None,
             smooth=smooth,
+            empty=empty,
         )
 
 

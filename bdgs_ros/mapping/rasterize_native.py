@@ -74,8 +74,9 @@ class NativeBackend:
             weights.color * weights.ssim,
             weights.depth,
             weights.smooth,
+            weights.empty,
         )
-        loss, l1, ssim, depth, smooth, d_log_gain, d_offset, pose = self.workspace.fused_step(
+        *terms_found, d_log_gain, d_offset, pose = self.workspace.fused_step(
             *_arguments(scene),
             target.color,
             target.depth,
@@ -85,6 +86,7 @@ class NativeBackend:
             arrays,
             images,
         )
+        loss, l1, ssim, depth, smooth, empty = terms_found
         return FusedResult(
             loss,
             l1,
@@ -95,6 +97,7 @@ class NativeBackend:
             arrays[5],
             Rendered(*images) if images else None,
             smooth,
+            empty,
         )
 
     def adam_step(

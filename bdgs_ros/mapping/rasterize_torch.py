@@ -263,6 +263,7 @@ class ImageLoss(NamedTuple):
     ssim: Tensor  # 1 - SSIM
     depth: Tensor
     smooth: Tensor
+    empty: Tensor  # 1 - silhouette where depth is known
 
 
 def image_loss(
@@ -284,10 +285,15 @@ def image_loss(
     known = (depth > 0) & (depth < 1e30)
     depth = torch.where(known, depth, torch.zeros_like(depth))
     share = known * weight / (known * weight).sum().clamp_min(1e-30)
-    error = (share * (images[..., _DEPTH] - images[..., _SILHOUETTE] * depth).abs()).sum()
+    silhouette = images[..., _SILHOUETTE]
+    shown = images[..., _DEPTH] / silhouette.clamp_min(1e-6)
+    # what hardly shows pulls hardly; see src/rasterizer_loss.hpp for why that is not differentiated
+    error = (share * silhouette.detach() * (shown - depth).abs()).sum()
+    empty = (share * (1 - silhouette)).sum()
     color = (1 - weights.ssim) * l1 + weights.ssim * dissimilarity
     total = weights.color * color + weights.depth * error + weights.smooth * smooth
-    return ImageLoss(total, l1, dissimilarity, error, smooth)
+    total = total + weights.empty * empty
+    return ImageLoss(total, l1, dissimilarity, error, smooth, empty)
 
 
 class _View:
@@ -413,4 +419,5 @@ class TorchBackend:
             total.numpy().astype(np.float32),
             _rendered(images) if with_images else None,
             loss.smooth.item(),
+            loss.empty.item(),
         )

@@ -88,15 +88,17 @@ class LossWeights:
     """
     How the terms of a view's loss add up.
 
-    loss = color * [(1 - ssim) * L1 + ssim * (1 - SSIM)] + depth * L_depth + smooth * L_smooth;
-    `color` is lambda_psim of Eq. 7, `ssim` gamma of Eq. 9 and `smooth` the weight of the first
-    term of Eq. 8, whose edge-aware form `rasterize_torch.smoothness` defines.
+    loss = color * [(1 - ssim) * L1 + ssim * (1 - SSIM)] + depth * L_depth + smooth * L_smooth
+    + empty * L_empty; `color` is lambda_psim of Eq. 7, `ssim` gamma of Eq. 9 and `smooth` the
+    weight of the first term of Eq. 8, whose edge-aware form `rasterize_torch.smoothness` defines.
+    L_empty is the mean of 1 - silhouette where the camera measured a surface.
     """
 
     color: float
     ssim: float
     depth: float
     smooth: float = 0.0
+    empty: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -119,6 +121,8 @@ class FusedResult:
     """Before exposure; only if asked for."""
     smooth: float = 0.0
     """Mean departure of depth from planes in metres, edges left out; 0 if not weighted."""
+    empty: float = 0.0
+    """Mean of 1 - silhouette where depth was measured."""
 
 
 @dataclass(frozen=True)

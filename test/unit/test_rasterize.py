@@ -34,7 +34,7 @@ from bdgs_ros.mapping.rasterize import (
 
 CAMERA = PinholeCamera(48, 40, 45.0, 47.0, 23.3, 20.3)
 T_CAMERA_WORLD = se3.exp(np.array([0.1, -0.2, 0.3, 0.2, -0.3, 0.4]))
-WEIGHTS = LossWeights(color=0.85, ssim=0.2, depth=0.3, smooth=0.4)
+WEIGHTS = LossWeights(color=0.85, ssim=0.2, depth=0.3, smooth=0.4, empty=0.1)
 EXPOSURE = (0.1, -0.02)
 NATIVES = [name for name in available_backends() if name != 'torch']
 PARAMETERS = ('means', 'quats', 'log_scales', 'logit_opacities', 'colors')
@@ -137,7 +137,7 @@ def test_fused_step_agrees_with_autograd(name: str, seed: int) -> None:
     g = make_gaussians(seed=seed)
     target = make_target(g)
     ours, twin = step(g, target, backend=name), step(g, target, backend='torch')
-    for field in ('loss', 'l1', 'ssim', 'depth', 'smooth'):
+    for field in ('loss', 'l1', 'ssim', 'depth', 'smooth', 'empty'):
         assert getattr(ours, field) == pytest.approx(getattr(twin, field), rel=3e-5), field
     assert_gradients_agree(ours.gradients, twin.gradients, 1e-4)
     assert error(ours.exposure_gradient, twin.exposure_gradient) < 1e-4
@@ -145,7 +145,7 @@ def test_fused_step_agrees_with_autograd(name: str, seed: int) -> None:
 
 
 @native
-@pytest.mark.parametrize('term', ['color', 'ssim', 'depth', 'smooth'])
+@pytest.mark.parametrize('term', ['color', 'ssim', 'depth', 'smooth', 'empty'])
 def test_each_loss_term_agrees_alone(term: str) -> None:
     """No term hides behind another; measured at most 4e-5 (SSIM)."""
     weights = {
@@ -153,6 +153,7 @@ def test_each_loss_term_agrees_alone(term: str) -> None:
         'ssim': LossWeights(1.0, 1.0, 0.0),
         'depth': LossWeights(0.0, 0.0, 1.0),
         'smooth': LossWeights(0.0, 0.0, 0.0, 1.0),
+        'empty': LossWeights(0.0, 0.0, 0.0, 0.0, 1.0),
     }[term]
     g = make_gaussians(seed=3)
     target = make_target(g)

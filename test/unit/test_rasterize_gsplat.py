@@ -42,7 +42,7 @@ from bdgs_ros.mapping.rasterize_types import Scene, Target
 
 CAMERA = PinholeCamera(45, 37, 45.0, 47.0, 21.3, 18.3)  # no multiple of the tile
 T_CAMERA_WORLD = se3.exp(np.array([0.1, -0.2, 0.3, 0.2, -0.3, 0.4]))
-WEIGHTS = LossWeights(color=0.85, ssim=0.2, depth=0.3, smooth=0.4)
+WEIGHTS = LossWeights(color=0.85, ssim=0.2, depth=0.3, smooth=0.4, empty=0.1)
 EXPOSURE = (0.1, -0.02)
 PARAMETERS = ('means', 'quats', 'log_scales', 'logit_opacities', 'colors')
 IMAGES, GRADIENTS = 2e-5, 2e-4
@@ -168,7 +168,7 @@ def test_fused_step_agrees_with_twin(gsplat: str, seed: int) -> None:
     g = make_gaussians(seed=seed)
     target = make_target(g)
     ours, twin = step(g, target, gsplat), step(g, target, 'torch')
-    for field in ('loss', 'l1', 'ssim', 'depth', 'smooth'):
+    for field in ('loss', 'l1', 'ssim', 'depth', 'smooth', 'empty'):
         assert getattr(ours, field) == pytest.approx(getattr(twin, field), rel=1e-4), field
         assert getattr(twin, field) > 0
     assert_gradients_agree(ours.gradients, twin.gradients)
