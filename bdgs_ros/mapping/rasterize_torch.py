@@ -287,7 +287,7 @@ def image_loss(
     share = known * weight / (known * weight).sum().clamp_min(1e-30)
     silhouette = images[..., _SILHOUETTE]
     shown = images[..., _DEPTH] / silhouette.clamp_min(1e-6)
-    # what hardly shows pulls hardly; see src/rasterizer_loss.hpp for why that is not differentiated
+    # what hardly shows pulls hardly; src/rasterizer_loss.hpp says why that has no derivative
     error = (share * silhouette.detach() * (shown - depth).abs()).sum()
     empty = (share * (1 - silhouette)).sum()
     color = (1 - weights.ssim) * l1 + weights.ssim * dissimilarity
