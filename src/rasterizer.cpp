@@ -65,6 +65,7 @@ constexpr float kMaxAlpha = 0.99f, kMinTransmittance = 1e-4f;
 constexpr float kTileCentre = 0.5f * (kTile - 1);
 constexpr int kOutputs = 16;  // floats per slot: 8 for g, 8 for w
 constexpr uint32_t kCulled = 0xffffffffu;
+constexpr int kAhead = 24;     // how many elements ahead of its use memory is asked for
 constexpr int kRadixBits = 12, kRadix = 1 << kRadixBits;
 
 struct Box {  // pixels, inclusive
@@ -346,7 +347,7 @@ class Rasterizer {
   template <typename Visit>
   void for_each_tile(size_t begin, size_t end, Visit visit) {
     for (size_t s = begin; s < end; ++s) {
-      __builtin_prefetch(&boxes_[entries_[std::min(s + 16, end - 1)].id]);
+      __builtin_prefetch(&boxes_[entries_[std::min(s + kAhead, end - 1)].id]);
       const uint32_t id = entries_[s].id;
       const Box box = boxes_[id];
       for (int ty = box.y0 / kTile; ty <= box.y1 / kTile; ++ty)
@@ -369,7 +370,7 @@ class Rasterizer {
     }
   }
 
-  // Copy a tile's records side by side, centres relative to the tile's.
+  // Copy a tile's records side by side, centres relative to the tile's; z is that at the tile's.
   int collect_tile(int tile, TileScratch& scratch) {
     const int first = tile_first_[tile], n = tile_first_[tile + 1] - first;
     const float x0 = kTile * (tile % tiles_x_) + kTileCentre;
@@ -377,10 +378,12 @@ class Rasterizer {
     Record* local = scratch.records.reserve(n);
     const uint32_t* ids = slot_gaussian_.data() + first;
     for (int j = 0; j < n; ++j) {
-      __builtin_prefetch(&records_[ids[std::min(j + 8, n - 1)]]);
-      local[j] = records_[ids[j]];
-      local[j].u -= x0;
-      local[j].v -= y0;
+      __builtin_prefetch(&records_[ids[std::min(j + kAhead, n - 1)]]);
+      Record& r = local[j];
+      r = records_[ids[j]];
+      r.u -= x0;
+      r.v -= y0;
+      r.z -= r.zeta_u * r.u + r.zeta_v * r.v;
     }
     return n;
   }
@@ -457,7 +460,7 @@ class Rasterizer {
       red += w * r.red;
       green += w * r.green;
       blue += w * r.blue;
-      depth += w * (r.z + r.zeta_u * dx + r.zeta_v * dy);
+      depth += w * (r.z + r.zeta_u * px + r.zeta_v * py);
       dynamic += w * r.p_dynamic;
       if (kStatistics) {
         scratch.sums[2 * list[k]] += sum(w);
@@ -541,15 +544,13 @@ class Rasterizer {
     const Lanes g_blue = load_block(plane(kGradBlue) + at);
     const Lanes g_depth = load_block(plane(kGradDepth) + at);
     const Lanes g_silhouette = load_block(plane(kGradSilhouette) + at);
-    Matrix matrix;
     const Lanes px = pixel_x(block), py = pixel_y(block);
-    for (int l = 0; l < kLanes; ++l) {
-      const float x = px[l], y = py[l];
-      const float row[kOutputs] = {
-          1.0f,     x,          y,         x * x,      x * y,          y * y,          0,    0,
-          g_red[l], g_green[l], g_blue[l], g_depth[l], g_depth[l] * x, g_depth[l] * y, 1.0f, 0};
-      std::memcpy(matrix.row[l], row, sizeof(row));
-    }
+    const Lanes g_depth_x = g_depth * px, g_depth_y = g_depth * py;
+    const Lanes columns[kOutputs] = {
+        splat(1.0f), px,      py,     px * px, px * py,   py * py,   Lanes{},     Lanes{},
+        g_red,       g_green, g_blue, g_depth, g_depth_x, g_depth_y, splat(1.0f), Lanes{}};
+    Matrix matrix;
+    for (int k = 0; k < kOutputs; k += kLanes) transpose(columns + k, matrix.row[0] + k, kOutputs);
     Lanes rest = g_red * load_block(plane(kRed) + at) + g_green * load_block(plane(kGreen) + at) +
                  g_blue * load_block(plane(kBlue) + at) +
                  g_depth * load_block(plane(kDepth) + at) +
@@ -561,9 +562,8 @@ class Rasterizer {
       const Record& r = records[locals[k]];
       const Lanes alpha = load(alphas + static_cast<size_t>(k) * kLanes);
       const Lanes w = alpha * T;
-      const Lanes z = r.z + r.zeta_u * (px - r.u) + r.zeta_v * (py - r.v);
-      const Lanes u = g_red * r.red + g_green * r.green + g_blue * r.blue + g_depth * z +
-                      g_silhouette;
+      const Lanes u = g_red * r.red + g_green * r.green + g_blue * r.blue + g_depth * r.z +
+                      g_depth_x * r.zeta_u + g_depth_y * r.zeta_v + g_silhouette;
       rest -= w * u;
       // g = alpha dL/dalpha; a clamped alpha does not move with the Gaussian
       Lanes g = w * u - alpha * rest * reciprocal(1.0f - alpha);
@@ -638,19 +638,23 @@ class Rasterizer {
 
   // Sum the slots of Gaussians i .. i + kLanes - 1; false if none has any.
   bool sum_slots(int i, Moments& m) {
-    alignas(64) float sums[kLanes][kOutputs] = {};
     // first_slot_ goes on beyond the last Gaussian
     for (uint32_t s = first_slot_[i + kLanes]; s < first_slot_[i + 2 * kLanes]; ++s)
       __builtin_prefetch(&slot_sums_[static_cast<size_t>(slots_of_[s]) * kOutputs]);
     if (first_slot_[i] == first_slot_[i + kLanes]) return false;
-    for (int lane = 0; lane < kLanes; ++lane)
+    constexpr int kParts = kOutputs / kLanes;
+    Lanes sums[kParts][kLanes];
+    for (int lane = 0; lane < kLanes; ++lane) {
+      Lanes total[kParts] = {};
       for (uint32_t s = first_slot_[i + lane]; s < first_slot_[i + lane + 1]; ++s) {
         const float* from = &slot_sums_[static_cast<size_t>(slots_of_[s]) * kOutputs];
-        for (int k = 0; k < kOutputs; ++k) sums[lane][k] += from[k];
+        for (int part = 0; part < kParts; ++part) total[part] += load(from + part * kLanes);
       }
+      for (int part = 0; part < kParts; ++part) sums[part][lane] = total[part];
+    }
     alignas(64) float columns[kOutputs][kLanes];
-    for (int k = 0; k < kOutputs; ++k)
-      for (int lane = 0; lane < kLanes; ++lane) columns[k][lane] = sums[lane][k];
+    for (int part = 0; part < kParts; ++part)
+      transpose(sums[part], columns[part * kLanes], kLanes);
     m.g = load(columns[0]);
     m.gx = load(columns[1]);
     m.gy = load(columns[2]);

@@ -16,6 +16,8 @@
 
 #pragma once
 
+#include <algorithm>
+
 #include "rasterizer_simd.hpp"
 
 namespace bdgs {
@@ -51,29 +53,22 @@ struct Parameters {
 // tail repeats the last row; callers mask it.
 template <int kColumns>
 inline void load_rows(const float* array, int i, int count, Lanes* out) {
-  alignas(64) float columns[kColumns][kLanes];
-  if (i + kLanes <= count) {
-    const float* row = array + static_cast<size_t>(i) * kColumns;
-    for (int lane = 0; lane < kLanes; ++lane)
-      for (int k = 0; k < kColumns; ++k) columns[k][lane] = row[lane * kColumns + k];
-  } else {
-    for (int lane = 0; lane < kLanes; ++lane) {
-      const int row = i + lane < count ? i + lane : count - 1;
-      for (int k = 0; k < kColumns; ++k)
-        columns[k][lane] = array[static_cast<size_t>(row) * kColumns + k];
-    }
-  }
-  for (int k = 0; k < kColumns; ++k) out[k] = load(columns[k]);
+  const float* row = array + static_cast<size_t>(i) * kColumns;
+  if (i + kLanes <= count) return split_columns<kColumns>(row, out);
+  alignas(64) float rows[kLanes * kColumns];
+  for (int lane = 0; lane < kLanes; ++lane)
+    std::memcpy(rows + lane * kColumns, row + std::min(lane, count - 1 - i) * kColumns,
+                kColumns * sizeof(float));
+  split_columns<kColumns>(rows, out);
 }
 
 template <int kColumns>
 inline void store_rows(float* array, int i, int count, const Lanes* in) {
-  alignas(64) float columns[kColumns][kLanes];
-  for (int k = 0; k < kColumns; ++k) store(columns[k], in[k]);
-  const int rows = i + kLanes <= count ? kLanes : count - i;
   float* row = array + static_cast<size_t>(i) * kColumns;
-  for (int lane = 0; lane < rows; ++lane)
-    for (int k = 0; k < kColumns; ++k) row[lane * kColumns + k] = columns[k][lane];
+  if (i + kLanes <= count) return join_columns<kColumns>(in, row);
+  alignas(64) float rows[kLanes * kColumns];
+  join_columns<kColumns>(in, rows);
+  std::memcpy(row, rows, (count - i) * kColumns * sizeof(float));
 }
 
 struct Ellipses {

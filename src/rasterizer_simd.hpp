@@ -119,6 +119,93 @@ inline float largest(Lanes v) {
   return best;
 }
 
+// Row l of `to` becomes lane l of all kLanes vectors.
+inline void transpose(const Lanes* from, float* to, size_t stride) {
+#if defined(__AVX512F__)
+  __m512 a[16], b[16];
+  for (int k = 0; k < 16; k += 2) {  // pairs of lanes, within each quarter
+    const __m512 even = reinterpret_cast<__m512>(from[k]), odd = reinterpret_cast<__m512>(from[k + 1]);
+    a[k] = _mm512_unpacklo_ps(even, odd);
+    a[k + 1] = _mm512_unpackhi_ps(even, odd);
+  }
+  for (int k = 0; k < 16; k += 4)  // fours
+    for (int h = 0; h < 2; ++h) {
+      const __m512d one = _mm512_castps_pd(a[k + h]), other = _mm512_castps_pd(a[k + 2 + h]);
+      b[k + 2 * h] = _mm512_castpd_ps(_mm512_unpacklo_pd(one, other));
+      b[k + 2 * h + 1] = _mm512_castpd_ps(_mm512_unpackhi_pd(one, other));
+    }
+  for (int k = 0; k < 4; ++k) {  // quarters
+    const __m512 near_low = _mm512_shuffle_f32x4(b[k], b[4 + k], 0x88);
+    const __m512 near_high = _mm512_shuffle_f32x4(b[k], b[4 + k], 0xdd);
+    const __m512 far_low = _mm512_shuffle_f32x4(b[8 + k], b[12 + k], 0x88);
+    const __m512 far_high = _mm512_shuffle_f32x4(b[8 + k], b[12 + k], 0xdd);
+    _mm512_storeu_ps(to + k * stride, _mm512_shuffle_f32x4(near_low, far_low, 0x88));
+    _mm512_storeu_ps(to + (8 + k) * stride, _mm512_shuffle_f32x4(near_low, far_low, 0xdd));
+    _mm512_storeu_ps(to + (4 + k) * stride, _mm512_shuffle_f32x4(near_high, far_high, 0x88));
+    _mm512_storeu_ps(to + (12 + k) * stride, _mm512_shuffle_f32x4(near_high, far_high, 0xdd));
+  }
+#else
+  for (int k = 0; k < kLanes; ++k)
+    for (int l = 0; l < kLanes; ++l) to[l * stride + k] = from[k][l];
+#endif
+}
+
+#if defined(__AVX512F__)
+// Element order[t] of the concatenation of up to four vectors becomes lane t.
+template <int kCount>
+inline Lanes pick(const Lanes* from, const int32_t* order) {
+  const __m512i index = _mm512_load_si512(order);
+  const auto part = [&](int k) { return reinterpret_cast<__m512>(from[k < kCount ? k : 0]); };
+  const __m512 low = _mm512_permutex2var_ps(part(0), index, part(1));
+  if (kCount <= 2) return reinterpret_cast<Lanes>(low);
+  const __mmask16 is_high = _mm512_cmpge_epi32_mask(index, _mm512_set1_epi32(32));
+  const __m512 high = _mm512_permutex2var_ps(part(2), index, part(3));
+  return reinterpret_cast<Lanes>(_mm512_mask_blend_ps(is_high, low, high));
+}
+
+template <int kColumns>
+struct PickOrders {
+  alignas(64) int32_t split[kColumns][kLanes], join[kColumns][kLanes];
+
+  constexpr PickOrders() : split(), join() {
+    for (int e = 0; e < kColumns * kLanes; ++e) {  // row e / kColumns, column e % kColumns
+      split[e % kColumns][e / kColumns] = e;
+      join[e / kLanes][e % kLanes] = e % kColumns * kLanes + e / kColumns;
+    }
+  }
+};
+template <int kColumns>
+inline constexpr PickOrders<kColumns> kPickOrders{};
+#endif
+
+// kLanes rows of kColumns <= 4 floats to one vector per column, and back.
+template <int kColumns>
+inline void split_columns(const float* rows, Lanes* out) {
+#if defined(__AVX512F__)
+  Lanes in[kColumns];
+  for (int k = 0; k < kColumns; ++k) in[k] = load(rows + k * kLanes);
+  for (int k = 0; k < kColumns; ++k) out[k] = pick<kColumns>(in, kPickOrders<kColumns>.split[k]);
+#else
+  alignas(64) float columns[kColumns][kLanes];
+  for (int lane = 0; lane < kLanes; ++lane)
+    for (int k = 0; k < kColumns; ++k) columns[k][lane] = rows[lane * kColumns + k];
+  for (int k = 0; k < kColumns; ++k) out[k] = load(columns[k]);
+#endif
+}
+
+template <int kColumns>
+inline void join_columns(const Lanes* in, float* rows) {
+#if defined(__AVX512F__)
+  for (int k = 0; k < kColumns; ++k)
+    store(rows + k * kLanes, pick<kColumns>(in, kPickOrders<kColumns>.join[k]));
+#else
+  alignas(64) float columns[kColumns][kLanes];
+  for (int k = 0; k < kColumns; ++k) store(columns[k], in[k]);
+  for (int lane = 0; lane < kLanes; ++lane)
+    for (int k = 0; k < kColumns; ++k) rows[lane * kColumns + k] = columns[k][lane];
+#endif
+}
+
 // An array that keeps its memory between calls and starts on a cache line.
 template <typename T>
 class Buffer {
