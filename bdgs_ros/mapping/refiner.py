@@ -49,6 +49,7 @@ class Refiner:
         self._optimiser = Optimiser(config)
         self._rng = np.random.default_rng(config.seed)
         self._waiting: list[int] = []
+        self._anchor = min(keyframes, key=lambda keyframe: keyframe.index)
 
     def step(self, progress: float) -> float:
         """
@@ -61,7 +62,11 @@ class Refiner:
 
         """
         keyframe = self._next_keyframe()
-        return self._optimiser.step(self._map, keyframe, _FINEST, rate_scale(progress))
+        exposure = keyframe.exposure.copy()
+        loss = self._optimiser.step(self._map, keyframe, _FINEST, rate_scale(progress))
+        if keyframe is self._anchor:  # else colours and exposures could drift together
+            keyframe.exposure[:] = exposure
+        return loss
 
     def _next_keyframe(self) -> MapKeyframe:
         """Return keyframes in random order, each once before any comes again."""

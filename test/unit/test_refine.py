@@ -85,6 +85,16 @@ def test_all_keyframes_get_their_turn(monkeypatch):
     assert [sorted(turns[i : i + 4]) for i in (0, 4, 8)] == [[0, 1, 2, 3]] * 3
 
 
+def test_the_oldest_keyframe_holds_the_exposure():
+    mapper = mapped()
+    mapper.keyframes = mapper.keyframes[1:]  # the first, which never adapts, was dropped
+    for keyframe in mapper.keyframes:
+        keyframe.exposure[:] = [0.1, 0.02]
+    refine_map(mapper, CONFIG.mapping, seconds=None, iterations=20)
+    np.testing.assert_array_equal(mapper.keyframes[0].exposure, np.float32([0.1, 0.02]))
+    assert (mapper.keyframes[1].exposure != np.float32([0.1, 0.02])).any()
+
+
 def test_rates_fall_to_a_tenth():
     scales = [rate_scale(p) for p in (-1.0, 0.0, 0.5, 1.0, 2.0)]
     assert scales[:2] == [1.0, 1.0]
