@@ -21,12 +21,13 @@ PARAMETERS = ('means', 'quats', 'log_scales', 'logit_opacities', 'colors')
 
 @dataclass(frozen=True)
 class NewGaussians:
-    """Gaussians to be added, M of them, isotropic."""
+    """Gaussians to be added, M of them."""
 
     means: Array  # [M, 3] metres in world
-    scales: Array  # [M] metres
+    scales: Array  # [M] or [M, 3] metres: round, or along each axis
     colors: Array  # [M, 3] RGB in [0, 1]
     belief: Array  # [M] P(dynamic)
+    quats: Array | None = None  # [M, 4] wxyz, axes to world; None: along those of world
 
 
 class GaussianMap:
@@ -104,8 +105,8 @@ class GaussianMap:
         count = len(new.means)
         added = {
             'means': new.means,
-            'quats': np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
-            'log_scales': np.repeat(np.log(new.scales)[:, None], 3, axis=1),
+            'quats': _unturned(count) if new.quats is None else new.quats,
+            'log_scales': _three(np.log(new.scales)),
             'logit_opacities': np.full(count, logit(np.array([opacity], np.float32))[0]),
             'colors': new.colors,
         }
@@ -133,6 +134,14 @@ class GaussianMap:
         """Return the size of the parameters and beliefs in memory, without optimiser state."""
         arrays = [*self.parameters.values(), self.belief.belief, self.keyframe_index]
         return sum(a.nbytes for a in arrays) / 1e6
+
+
+def _unturned(count: int) -> Array:
+    return np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1))
+
+
+def _three(scales: Array) -> Array:
+    return scales if scales.ndim == 2 else np.repeat(scales[:, None], 3, axis=1)
 
 
 def _moments_like(array: Array) -> list[Array]:

@@ -9,35 +9,28 @@ from numpy.typing import NDArray
 from bdgs_ros.core.config import BeliefConfig
 from bdgs_ros.core.config.mapping import InsertConfig, PruneConfig
 from bdgs_ros.core.types import DepthImage
-from bdgs_ros.mapping.gaussians import GaussianMap, NewGaussians
-from bdgs_ros.mapping.keyframes import MapKeyframe
+from bdgs_ros.mapping.gaussians import GaussianMap
 from bdgs_ros.mapping.rasterize import Rendered
 
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 
-def far_from_movers(keyframe: MapKeyframe, config: InsertConfig) -> Mask:
-    """Return the pixels of the finest level that keep a margin from all that moves, [H, W]."""
-    moving = (keyframe.levels[0].weight == 0).astype(np.uint8)
+def far_from_movers(static: Mask, config: InsertConfig) -> Mask:
+    """Return the pixels that keep a margin from all that moves, [H, W]."""
+    moving = (~static).astype(np.uint8)
     reach = 2 * config.margin_px + 1
     return np.asarray(cv2.dilate(moving, np.ones((reach, reach), np.uint8)) == 0)
 
 
 def usable_depth(depth_m: DepthImage, config: InsertConfig) -> Mask:
     """
-    Return the pixels of the insertion grid with a depth in range and off edges, [H, W].
+    Return the pixels with a depth in range and off edges, [H, W].
 
     On edges the sensor mixes two surfaces.
     """
     in_range = (depth_m > config.min_depth) & (depth_m < config.max_depth)
-    return in_range & ~depth_edges(depth_m, config.edge) & _grid(depth_m.shape, config.stride)
-
-
-def _grid(shape: tuple[int, ...], stride: int) -> Mask:
-    grid = np.zeros(shape, bool)
-    grid[stride // 2 :: stride, stride // 2 :: stride] = True
-    return grid
+    return in_range & ~depth_edges(depth_m, config.edge)
 
 
 def depth_edges(depth_m: DepthImage, relative: float) -> Mask:
@@ -83,21 +76,6 @@ def surface_depth(rendered: Rendered) -> DepthImage:
     """Return rendered depth over silhouette, metres; 0 where the map is empty."""
     safe = np.maximum(rendered.silhouette, 1e-6)
     return np.where(rendered.silhouette > 1e-3, rendered.depth / safe, 0).astype(np.float32)
-
-
-def lift(keyframe: MapKeyframe, pixels: Mask, belief: float, config: InsertConfig) -> NewGaussians:
-    """Turn pixels of a keyframe's finest level into Gaussians in world."""
-    level = keyframe.levels[0]
-    points = level.camera.unproject(level.depth_m)[pixels]
-    T = keyframe.T_world_camera.astype(np.float32)
-    gain, offset = np.exp(keyframe.exposure[0]), keyframe.exposure[1]
-    spacing = points[:, 2] * np.float32(config.stride / level.camera.fx)
-    return NewGaussians(
-        means=points @ T[:3, :3].T + T[:3, 3],
-        scales=np.float32(config.sigma_px) * spacing,
-        colors=(level.color[pixels] - offset) / gain,
-        belief=np.full(len(points), belief, np.float32),
-    )
 
 
 def worth_keeping(gaussians: GaussianMap, config: PruneConfig) -> Mask:

@@ -23,9 +23,11 @@ from bdgs_ros.mapping.keyframes import (
     most_redundant,
     shrink,
 )
+from bdgs_ros.mapping.lift import lift
 from bdgs_ros.mapping.map_files import load_map, save_map
 from bdgs_ros.mapping.optimise import Optimiser
 from bdgs_ros.mapping.rasterize import Rendered, render
+from bdgs_ros.mapping.surface import fit_surface
 
 Mask = NDArray[np.bool_]
 
@@ -155,22 +157,23 @@ class Mapper:
         config = self._config.insert
         level = current.levels[0]
         usable = growth.usable_depth(level.depth_m, config)
+        sigma = self._sigma(level.depth_m)
+        surface = fit_surface(level.depth_m, usable, level.camera, config.normal_px, sigma)
+
+        def grow(pixels: Mask, belief: float) -> None:
+            new = lift(current, level, surface, pixels, belief, config)
+            self.map.append(new, config.opacity, current.index)
+
         everything = self.render_everything(current.T_world_camera, level.camera)
-        unknown = ~growth.explained(
-            level.depth_m, everything, self._sigma(level.depth_m), config.depth_sigma
-        )
+        unknown = ~growth.explained(level.depth_m, everything, sigma, config.depth_sigma)
         empty = growth.empty_pixels(static, config) & unknown
-        still = growth.far_from_movers(current, config)
-        self._append(current, usable & still & empty, self._belief.initial)
+        still = growth.far_from_movers(level.weight > 0, config)
+        grow(usable & still & empty, self._belief.initial)
         # What stands in front of the map and no detector names may be new furniture: it enters
         # hidden by Eq. 11, and the filter decides whether it stays.
         unnamed = ~is_dynamic(current.p_dynamic)
         new = without_specks(in_front & unknown & unnamed, _MIN_BLOB_SHARE)
-        self._append(current, usable & new, self._belief.initial_in_front)
-
-    def _append(self, current: MapKeyframe, pixels: Mask, belief: float) -> None:
-        new = growth.lift(current, pixels, belief, self._config.insert)
-        self.map.append(new, self._config.insert.opacity, current.index)
+        grow(usable & new, self._belief.initial_in_front)
 
     def _companions(self) -> list[MapKeyframe]:
         """Return the window and as many older keyframes at random, in random order."""

@@ -17,7 +17,7 @@ CAMERA = PinholeCamera(96, 72, 90.0, 90.0, 47.5, 35.5)
 SECOND = 1_000_000_000
 WALL_Z = 2.0
 CONFIG = with_values(
-    BdgsConfig(), {'mapping.iterations': 20, 'mapping.threads': 1, 'mapping.insert.stride': 1}
+    BdgsConfig(), {'mapping.iterations': 20, 'mapping.threads': 1, 'mapping.insert.doublings': 0}
 )
 
 

@@ -36,9 +36,27 @@ class InsertConfig:
 
     silhouette: float = param(0.6, 'the map is empty below', low=0.0, high=1.0)
     depth_sigma: float = param(5.0, 'nearer than the map beyond this', unit='sigma_z', low=0.5)
-    stride: int = param(2, 'pixels of the mapping image per Gaussian and axis', low=1, high=32)
+    finest: int = param(
+        1,
+        'pixels of the mapping image per Gaussian and axis where there is detail',
+        low=1,
+        high=16,
+    )
+    doublings: int = param(3, 'times that it doubles where there is none', low=0, high=6)
+    detail: float = param(
+        0.04, 'cells that lose more of the image (RMS of colour in [0, 1]) are split', low=0.0
+    )
     sigma_px: float = param(
-        0.6, 'standard deviation of a new Gaussian over the stride', low=0.1, high=5.0
+        0.85, 'standard deviation of a new Gaussian over its cell', low=0.1, high=5.0
+    )
+    flatness: float = param(
+        0.2, 'thickness of a new Gaussian over its width; 1 makes them round', low=0.01, high=1.0
+    )
+    max_slant: float = param(
+        5.0, 'greatest length over width of a new Gaussian on a slanted surface', low=1.0
+    )
+    normal_px: int = param(
+        4, 'radius of the largest window in which planes are fitted', unit='px', low=1, high=32
     )
     opacity: float = param(0.7, 'opacity of a new Gaussian', low=0.01, high=0.99)
     min_depth: float = param(0.3, 'nearer depths are not used', unit='m', low=0.0)

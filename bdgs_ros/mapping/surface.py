@@ -1,0 +1,103 @@
+"""The surface under each pixel of a depth image: inverse depth, normal, and whether it is flat."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bdgs_ros.core.camera import PinholeCamera
+from bdgs_ros.core.types import DepthImage
+
+Array = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+_MIN_SHARE = 0.4  # of a window's pixels that must have a depth
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Planes through the pixels of one depth image, in its camera's frame."""
+
+    normals: Array
+    """[H, W, 3] of unit length, towards the camera; 0 where no plane fits"""
+    inverse_depth: Array
+    """[H, W] of the plane at the pixel where one fits, else as measured; 1/m, 0 = unknown"""
+    flat: Mask
+    """[H, W] whether a plane fits"""
+
+
+def fit_surface(
+    depth_m: DepthImage,
+    usable: Mask,
+    camera: PinholeCamera,
+    largest: int,
+    tolerance: Array,
+) -> Surface:
+    """
+    Fit a plane around every pixel, in the largest window in which one fits.
+
+    A plane n.X = d has inverse depth 1/z = (n.r) / d at the ray r = (x, y, 1), which is affine
+    in (x, y): an ordinary least-squares problem whose sums are box filters.
+
+    Parameters
+    ----------
+    depth_m : ndarray, shape (H, W)
+        Metres; 0 = unknown.
+    usable : ndarray of bool, shape (H, W)
+        Which pixels take part: not those on edges.
+    camera : PinholeCamera
+        Of `depth_m`.
+    largest : int
+        Radius of the first windows in px; it is halved twice where no plane fits.
+    tolerance : ndarray, shape (H, W)
+        Root mean square distance in metres from the plane that still counts as flat.
+
+    """
+    usable = usable & (depth_m > 0)
+    measured = np.where(usable, 1 / np.maximum(depth_m, 1e-3), 0).astype(np.float32)
+    normals = np.zeros((*depth_m.shape, 3), np.float32)
+    inverse_depth = measured.copy()
+    flat = np.zeros(depth_m.shape, bool)
+    limit = tolerance * measured**2  # d(1/z) = dz / z^2
+    for radius in sorted({max(1, largest >> i) for i in range(3)}, reverse=True):
+        plane, rms, share = _fit_window(measured, usable, camera, radius)
+        fits = usable & ~flat & (share >= _MIN_SHARE) & (rms < limit)
+        at_pixel = np.einsum('hwi,hwi->hw', plane, camera.rays())
+        fits &= np.abs(at_pixel - measured) < 2 * limit
+        normals[fits] = -plane[fits]
+        inverse_depth[fits] = at_pixel[fits]
+        flat |= fits
+    length = np.linalg.norm(normals, axis=2, keepdims=True)
+    return Surface(normals / np.maximum(length, 1e-12), inverse_depth, flat)
+
+
+def _fit_window(
+    inverse_depth: Array, usable: Mask, camera: PinholeCamera, radius: int
+) -> tuple[Array, Array, Array]:
+    """
+    Fit 1/z = p.(x, y, 1) around every pixel.
+
+    Returns p, shape (H, W, 3), the root mean square residual in 1/m, shape (H, W), and the share
+    of the window that took part.
+    """
+    x, y = camera.rays()[..., 0], camera.rays()[..., 1]
+    w, q = usable.astype(np.float32), inverse_depth
+    wx, wy, wq = w * x, w * y, w * q
+    terms = (w, wx, wy, wq, wx * x, wx * y, wy * y, wq * x, wq * y, wq * q)
+    size = (2 * radius + 1, 2 * radius + 1)
+    sums = [cv2.boxFilter(a, -1, size, borderType=cv2.BORDER_CONSTANT) for a in terms]
+    share = np.asarray(sums[0], np.float32)
+    once = 1 / np.maximum(share, np.float32(1e-6))
+    mx, my, mq, mxx, mxy, myy, mqx, mqy, mqq = (a * once for a in sums[1:])
+    sxx, sxy, syy = mxx - mx * mx, mxy - mx * my, myy - my * my
+    sqx, sqy, sqq = mqx - mq * mx, mqy - mq * my, mqq - mq * mq
+    # A full window has this variance along each axis; far less means one direction is unseen.
+    spread = radius * (radius + 1) / (3 * camera.fx**2)
+    once = 1 / np.maximum(sxx * syy - sxy * sxy, np.float32((0.05 * spread) ** 2))
+    a = (syy * sqx - sxy * sqy) * once
+    b = (sxx * sqy - sxy * sqx) * once
+    residual = np.sqrt(np.maximum(sqq - a * sqx - b * sqy, 0))
+    return np.stack([a, b, mq - a * mx - b * my], axis=2), residual, share
