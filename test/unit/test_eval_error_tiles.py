@@ -48,10 +48,12 @@ def test_nothing_to_picture_is_said(tmp_path):
 
 
 def test_peak_of_memory_sees_an_allocation():
+    if not memory.restart_peak():
+        pytest.skip('this system cannot forget the peak of earlier tests')
     before = memory.peak_mb()
     block = np.ones(30_000_000)
     during = memory.peak_mb()
-    assert during > before + 100
+    assert during > before + 200
     del block
-    if memory.restart_peak():
-        assert memory.peak_mb() < during - 100
+    assert memory.restart_peak()
+    assert memory.peak_mb() < during - 100
