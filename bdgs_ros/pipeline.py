@@ -65,6 +65,7 @@ class BdgsSlam:
         start = se3.identity() if T_world_camera is None else T_world_camera
         self.reset()
         self.mapper.load(map_file)
+        self.mapper.history.begin_run()
         self.mapper.frozen = localise
         rectified = camera.rectified()
         small = rectified.scaled(min(1.0, self._map_width / camera.width))

@@ -237,7 +237,7 @@ class _Views:
         self.name = sequence.name
         self._truth = open_truth(recording)
         est = read_trajectory(self._trajectory_file)
-        trained = frozenset(self._mapper.keyframe_stamps_ns)
+        trained = frozenset(self._mapper.history.stamps_ns)
         result, _ = relabel(sequence, est, job.config, self._truth, trained)
         self._samples = _untrained(result.samples, trained)
 

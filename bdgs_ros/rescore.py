@@ -67,7 +67,7 @@ def rescore(
     mapper = Mapper(config.mapping, config.belief)
     mapper.load(folder / 'map.ply')
     truth = open_truth(recording)
-    result, labels = relabel(sequence, est, config, truth, frozenset(mapper.keyframe_stamps_ns))
+    result, labels = relabel(sequence, est, config, truth, frozenset(mapper.history.stamps_ns))
     metrics = write_results(
         folder,
         result,

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,9 @@ from numpy.typing import NDArray
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.errors import MapError
 from bdgs_ros.core.types import DepthImage, Pose
+from bdgs_ros.mapping.history import History
 from bdgs_ros.mapping.keyframes import MapKeyframe, build_levels
+from bdgs_ros.mapping.vignette import Vignette
 
 TRANSFORMS = 'transforms.json'
 _FORMAT = 1
@@ -46,8 +48,10 @@ class KeyframeSet:
 
     keyframes: Sequence[MapKeyframe] = ()
     """Those whose images are kept."""
-    stamps_ns: Sequence[int] = ()
-    """Of all frames that the map was ever fitted to; others may be used to test it."""
+    history: History = field(default_factory=History)
+    """Of all that ever were."""
+    vignette: Vignette = field(default_factory=Vignette)
+    """Of the camera, as far as it was found out."""
     next_index: int = 0
 
 
@@ -81,7 +85,8 @@ def write_keyframes(folder: Path, kept: KeyframeSet, gaussians: int) -> None:
             'format': _FORMAT,
             'gaussians': gaussians,
             'next_index': kept.next_index,
-            'keyframe_stamps_ns': list(kept.stamps_ns),
+            'history': kept.history.to_document(),
+            'vignette': list(kept.vignette.coefficients),
         },
         'frames': frames,
     }
@@ -91,9 +96,9 @@ def write_keyframes(folder: Path, kept: KeyframeSet, gaussians: int) -> None:
 def _write_frame(folder: Path, keyframe: MapKeyframe) -> dict[str, Any]:
     finest = keyframe.levels[0]
     images: dict[str, NDArray[Any]] = {
-        'file_path': _to_bytes(finest.color)[..., ::-1],
+        'file_path': finest.image[..., ::-1],
         'depth_file_path': _to_millimetres(finest.depth_m),
-        'mask_path': np.where(finest.weight > 0, 255, 0).astype(np.uint8),
+        'mask_path': np.where(finest.static, 255, 0).astype(np.uint8),
         'dynamic_file_path': keyframe.p_dynamic,
     }
     paths = {key: f'{_KINDS[key]}/{keyframe.index:06d}.png' for key in images}
@@ -107,10 +112,6 @@ def _write_frame(folder: Path, keyframe: MapKeyframe) -> dict[str, Any]:
         'keyframe_index': int(keyframe.index),
         'exposure': [float(value) for value in keyframe.exposure],
     }
-
-
-def _to_bytes(color: NDArray[np.float32]) -> NDArray[np.uint8]:
-    return np.asarray(np.clip(color * 255 + 0.5, 0, 255), np.uint8)
 
 
 def _to_millimetres(depth_m: DepthImage) -> NDArray[np.uint16]:
@@ -164,8 +165,10 @@ def read_keyframes(folder: Path, levels: int) -> KeyframeSet:
     document = _read_document(folder)
     own = document['bdgs']
     try:
-        keyframes = [_read_frame(folder, entry, levels) for entry in document['frames']]
-        stamps_ns = [int(stamp) for stamp in own['keyframe_stamps_ns']]
+        vignette = Vignette(*map(float, own['vignette']))
+        entries = document['frames']
+        keyframes = [_read_frame(folder, entry, levels, vignette) for entry in entries]
+        history = History.from_document(own['history'])
         next_index = int(own['next_index'])
     except (KeyError, TypeError, ValueError) as error:
         raise MapError(
@@ -173,7 +176,7 @@ def read_keyframes(folder: Path, levels: int) -> KeyframeSet:
             f"remove '{folder}' to use the map without its keyframes"
         ) from error
     newest = max((keyframe.index for keyframe in keyframes), default=-1)
-    return KeyframeSet(keyframes, stamps_ns, max(next_index, newest + 1))
+    return KeyframeSet(keyframes, history, vignette, max(next_index, newest + 1))
 
 
 def _read_document(folder: Path) -> dict[str, Any]:
@@ -194,7 +197,9 @@ def _read_document(folder: Path) -> dict[str, Any]:
     return dict(document)
 
 
-def _read_frame(folder: Path, entry: Mapping[str, Any], levels: int) -> MapKeyframe:
+def _read_frame(
+    folder: Path, entry: Mapping[str, Any], levels: int, vignette: Vignette
+) -> MapKeyframe:
     camera = PinholeCamera(
         int(entry['w']),
         int(entry['h']),
@@ -214,7 +219,7 @@ def _read_frame(folder: Path, entry: Mapping[str, Any], levels: int) -> MapKeyfr
         int(entry['stamp_ns']),
         _pose(entry['transform_matrix']),
         read(entry['dynamic_file_path'], np.uint8, 1),
-        build_levels(color, depth_m, ~usable, camera, levels),
+        build_levels(color, depth_m, ~usable, camera, levels, vignette),
         exposure,
     )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -13,11 +13,13 @@ from bdgs_ros.core import se3
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.types import (
     DYNAMIC_THRESHOLD,
+    ColorImage,
     DepthImage,
     Keyframe,
     Pose,
     ProbabilityImage,
 )
+from bdgs_ros.mapping.vignette import Vignette
 
 Array = NDArray[np.float32]
 
@@ -25,13 +27,49 @@ _SAME_SURFACE = 0.03  # of the depth: larger steps between neighbours are edges
 
 
 @dataclass(frozen=True)
+class Window:
+    """A part of an image: one optimisation step need not look at all of it."""
+
+    rows: slice
+    columns: slice
+
+
+@dataclass(frozen=True)
 class Level:
-    """A keyframe's images at one level of the Gaussian pyramid GP^i of Eq. 12."""
+    """
+    A keyframe's images at one level of the Gaussian pyramid GP^i of Eq. 12.
+
+    They are kept as they came, in eight bits; `color` and `weight` are made when asked for.
+    """
 
     camera: PinholeCamera
-    color: Array  # [H, W, 3] in [0, 1]
+    image: ColorImage  # [H, W, 3]
     depth_m: DepthImage  # [H, W]
-    weight: Array  # [H, W] 1 where static, 0 where something moves
+    static: NDArray[np.bool_]  # [H, W] False where something moves
+    vignette: Vignette = field(default_factory=Vignette)
+
+    @property
+    def color(self) -> Array:
+        """RGB without the lens's falloff, nominally in [0, 1], [H, W, 3]."""
+        falloff = self.vignette.falloff(self.camera)
+        return np.asarray(self.image * (np.float32(1 / 255) / falloff)[..., None], np.float32)
+
+    @property
+    def weight(self) -> Array:
+        """1 where static, 0 where something moves, [H, W]."""
+        return self.static.astype(np.float32)
+
+    def cut(self, window: Window) -> Level:
+        """Return the part that a window shows, as a level with a camera of its own."""
+        at = (window.rows, window.columns)
+        camera = replace(
+            self.camera,
+            width=window.columns.stop - window.columns.start,
+            height=window.rows.stop - window.rows.start,
+            cx=self.camera.cx - window.columns.start,
+            cy=self.camera.cy - window.rows.start,
+        )
+        return Level(camera, self.image[at], self.depth_m[at], self.static[at], self.vignette)
 
 
 @dataclass(eq=False)
@@ -49,6 +87,14 @@ class MapKeyframe:
     exposure_moments: list[Array] = field(
         default_factory=lambda: [np.zeros(2, np.float32), np.zeros(2, np.float32)]
     )
+    pose_moments: list[Array] = field(
+        default_factory=lambda: [np.zeros(6, np.float32), np.zeros(6, np.float32)]
+    )
+
+    def move(self, xi: Array) -> None:
+        """Change the pose: `T_camera_world <- exp(xi) T_camera_world`, xi = (rho, phi), [6]."""
+        moved = se3.exp(xi.astype(np.float64)) @ self.T_camera_world
+        self.T_world_camera = se3.orthonormalise(se3.inverse(moved))
 
     @property
     def T_camera_world(self) -> Pose:
@@ -110,6 +156,7 @@ def build_levels(
     dynamic: NDArray[np.bool_],
     camera: PinholeCamera,
     count: int,
+    vignette: Vignette | None = None,
 ) -> tuple[Level, ...]:
     """
     Build the pyramid of Eq. 12, finest level first.
@@ -122,10 +169,11 @@ def build_levels(
         At that width.
     count : int
         Levels, L + 1 in the paper.
+    vignette : Vignette, optional
+        Of the camera; the levels follow what it learns later. None by default.
 
     """
-    image = color.astype(np.float32) / np.float32(255)
-    levels = [Level(camera, image, depth_m, 1 - dynamic.astype(np.float32))]
+    levels = [Level(camera, color, depth_m, ~dynamic, vignette or Vignette())]
     for _ in range(count - 1):
         levels.append(_halve(levels[-1]))
     return tuple(levels)
@@ -134,13 +182,14 @@ def build_levels(
 def _halve(level: Level) -> Level:
     camera = level.camera.scaled(0.5)
     size = (camera.width, camera.height)
-    color = cv2.resize(level.color, size, interpolation=cv2.INTER_AREA)
+    image = cv2.resize(level.image, size, interpolation=cv2.INTER_AREA)
     weight = cv2.resize(level.weight, size, interpolation=cv2.INTER_AREA)
     return Level(
         camera,
-        np.asarray(color, np.float32),
+        np.asarray(image, np.uint8),
         _sample_depth(level.depth_m, camera.shape),
-        np.asarray(weight >= 1, np.float32),
+        np.asarray(weight >= 1),
+        level.vignette,
     )
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,11 +14,21 @@ from bdgs_ros.core import se3
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.config import BeliefConfig, MappingConfig
 from bdgs_ros.core.images import without_specks
-from bdgs_ros.core.types import Keyframe, ModelView, Pose, ProbabilityImage
+from bdgs_ros.core.types import (
+    Keyframe,
+    ModelView,
+    Pose,
+    ProbabilityImage,
+    RgbdFrame,
+    Trajectory,
+)
 from bdgs_ros.mapping import growth
+from bdgs_ros.mapping.exposure import fit_exposure
 from bdgs_ros.mapping.gaussians import GaussianMap
+from bdgs_ros.mapping.history import History
 from bdgs_ros.mapping.keyframe_store import KeyframeSet
 from bdgs_ros.mapping.keyframes import (
+    Level,
     MapKeyframe,
     build_levels,
     is_dynamic,
@@ -28,9 +40,11 @@ from bdgs_ros.mapping.map_files import load_map, save_map
 from bdgs_ros.mapping.optimise import Optimiser
 from bdgs_ros.mapping.rasterize import Rendered, render
 from bdgs_ros.mapping.surface import fit_surface
+from bdgs_ros.mapping.vignette import Photo, Vignette
 
 Mask = NDArray[np.bool_]
 
+_PHOTOS = 4  # so many earlier keyframes are compared with
 _MIN_BLOB_SHARE = 0.002  # of the image; smaller things in front of the map are noise
 
 
@@ -49,7 +63,9 @@ class Mapper:
         """Forget the map."""
         self.map = GaussianMap(self._belief)
         self.keyframes: list[MapKeyframe] = []
-        self.keyframe_stamps_ns: list[int] = []  # of all that ever were, for the scores
+        self.history = History()
+        self.vignette = Vignette()
+        self._photos: list[Photo] = []
         self._count = 0
         self._rng = np.random.default_rng(self._config.seed)
 
@@ -70,16 +86,23 @@ class Mapper:
         """
         if not self._config.enabled:
             return None
-        small = shrink(keyframe, self._config.width)
-        if not self.frozen:
-            self._infer(small)
-            static = self.render(small.T_world_camera, small.frame.camera)
-            in_front = self._in_front(small, static)
-            current = self._remember(small, in_front)
-            self._insert(current, static, in_front)
-            self._optimiser.run(self.map, current, self._companions())
-            self.map.keep(growth.worth_keeping(self.map, self._config.prune))
-        return self.view(small.frame.stamp_ns, small.T_world_camera, small.frame.camera)
+        fine = shrink(keyframe, self._config.width)
+        if self.frozen:
+            return self.view(fine.frame.stamp_ns, fine.T_world_camera, fine.frame.camera)
+        small = shrink(fine, self._config.growth_width)
+        self._infer(small)
+        static = self.render(small.T_world_camera, small.frame.camera)
+        in_front = self._in_front(small, static)
+        level = self._growth_level(small, in_front)
+        current = self._remember(fine, level.static)
+        self._calibrate(current, level, static)
+        self._insert(current, level, static, in_front & ~is_dynamic(small.p_dynamic))
+        self._optimiser.run(self.map, current, self._companions())
+        self.map.keep(growth.worth_keeping(self.map, self._config.prune))
+        self.history.publish(current)
+        return self.view(
+            current.stamp_ns, current.T_world_camera, fine.frame.camera, current.exposure
+        )
 
     def render(self, T_world_camera: Pose, camera: PinholeCamera) -> Rendered:
         """Render the static map: what Eq. 11 lets through."""
@@ -106,7 +129,7 @@ class Mapper:
         observation = likelihood.Observation(
             se3.inverse(keyframe.T_world_camera),
             keyframe.frame.camera,
-            keyframe.frame.color.astype(np.float32) / np.float32(255),
+            self._in_map_colors(keyframe.frame),
             keyframe.frame.depth_m,
             keyframe.p_dynamic,
         )
@@ -122,40 +145,65 @@ class Mapper:
         seen_through = features.values[:, likelihood.FEATURES.index('free_space')] > 0
         self.map.keep(~growth.confirmed_gone(self.map, seen_through, self._belief))
 
+    def _in_map_colors(self, frame: RgbdFrame) -> NDArray[np.float32]:
+        """Return an image without falloff and, as far as is known yet, exposure, [H, W, 3]."""
+        log_gain, offset = self.history.exposure(frame.stamp_ns)
+        falloff = self.vignette.falloff(frame.camera)[..., None]
+        color = frame.color.astype(np.float32) / (np.float32(255) * falloff)
+        return np.asarray((color - offset) / np.exp(log_gain), np.float32)
+
     def _in_front(self, keyframe: Keyframe, static: Rendered) -> Mask:
         """Return where something stands before the static map, [H, W]."""
         depth_m = keyframe.frame.depth_m
         count = self._config.insert.depth_sigma
         return growth.pixels_in_front(depth_m, static, self._sigma(depth_m), count)
 
-    def _remember(self, keyframe: Keyframe, in_front: Mask) -> MapKeyframe:
-        """Keep the keyframe's images; what is labelled or stands in front does not count."""
-        frame = keyframe.frame
+    def _growth_level(self, keyframe: Keyframe, in_front: Mask) -> Level:
+        """Return the images that the map grows by; what stands in front may move."""
         moving = is_dynamic(keyframe.p_dynamic) | without_specks(in_front, _MIN_BLOB_SHARE)
-        levels = build_levels(
-            frame.color, frame.depth_m, moving, frame.camera, self._config.pyramid.levels
-        )
+        return self._levels(keyframe.frame, moving, 1)[0]
+
+    def _levels(self, frame: RgbdFrame, moving: Mask, count: int) -> tuple[Level, ...]:
+        return build_levels(frame.color, frame.depth_m, moving, frame.camera, count, self.vignette)
+
+    def _remember(self, keyframe: Keyframe, static: Mask) -> MapKeyframe:
+        """Keep the keyframe's images; `static` may be of a smaller size."""
+        frame = keyframe.frame
+        size = (frame.camera.width, frame.camera.height)
+        still = cv2.resize(static.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+        moving = is_dynamic(keyframe.p_dynamic) | (np.asarray(still) == 0)
+        levels = self._levels(frame, moving, self._config.pyramid.levels)
         current = MapKeyframe(
             self._count, frame.stamp_ns, keyframe.T_world_camera, keyframe.p_dynamic, levels
         )
         if self.keyframes:
             current.exposure = self.keyframes[-1].exposure.copy()
         self.keyframes.append(current)
-        self.keyframe_stamps_ns.append(current.stamp_ns)
+        self.history.add(current)
         if len(self.keyframes) > max(self._config.keyframes, self._config.window):
-            older = self.keyframes[: -self._config.window]
-            self.keyframes.remove(most_redundant(older))
+            redundant = most_redundant(self.keyframes[: -self._config.window])
+            self.history.refresh([redundant])
+            self.keyframes.remove(redundant)
         self._count += 1
         return current
+
+    def _calibrate(self, current: MapKeyframe, level: Level, static: Rendered) -> None:
+        """Learn the lens's falloff from earlier keyframes, and the exposure from the map."""
+        photo = Photo.of(level, current.T_world_camera)
+        for earlier in self._photos:
+            self.vignette.learn(photo, earlier)
+        self._photos = [*self._photos, photo][-_PHOTOS:]
+        exposure = fit_exposure(static, level)
+        if exposure is not None and current.index > 0:
+            current.exposure = exposure
 
     def _sigma(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
         config = self._belief.likelihood
         return np.asarray(config.depth_floor + config.depth_noise * depth_m**2, np.float32)
 
-    def _insert(self, current: MapKeyframe, static: Rendered, in_front: Mask) -> None:
+    def _insert(self, current: MapKeyframe, level: Level, static: Rendered, unnamed: Mask) -> None:
         """Add Gaussians where the map is empty and nothing moves; and, hidden, in front of it."""
         config = self._config.insert
-        level = current.levels[0]
         usable = growth.usable_depth(level.depth_m, config)
         sigma = self._sigma(level.depth_m)
         surface = fit_surface(level.depth_m, usable, level.camera, config.normal_px, sigma)
@@ -167,12 +215,11 @@ class Mapper:
         everything = self.render_everything(current.T_world_camera, level.camera)
         unknown = ~growth.explained(level.depth_m, everything, sigma, config.depth_sigma)
         empty = growth.empty_pixels(static, config) & unknown
-        still = growth.far_from_movers(level.weight > 0, config)
+        still = growth.far_from_movers(level.static, config)
         grow(usable & still & empty, self._belief.initial)
         # What stands in front of the map and no detector names may be new furniture: it enters
         # hidden by Eq. 11, and the filter decides whether it stays.
-        unnamed = ~is_dynamic(current.p_dynamic)
-        new = without_specks(in_front & unknown & unnamed, _MIN_BLOB_SHARE)
+        new = without_specks(unnamed & unknown, _MIN_BLOB_SHARE)
         grow(usable & new, self._belief.initial_in_front)
 
     def _companions(self) -> list[MapKeyframe]:
@@ -185,9 +232,37 @@ class Mapper:
             window = window + [older[i] for i in chosen]
         return [window[i] for i in self._rng.permutation(len(window))]
 
-    def view(self, stamp_ns: int, T_world_camera: Pose, camera: PinholeCamera) -> ModelView:
+    def photograph(self, T_world_camera: Pose, camera: PinholeCamera, stamp_ns: int) -> Rendered:
+        """
+        Render the static map as the camera would show it at a time: exposed, and with falloff.
+
+        The exposure is blended between the keyframes around that time.
+        """
+        self.history.refresh(self.keyframes)
+        exposure = self.history.exposure(stamp_ns)
+        return self._exposed(self.render(T_world_camera, camera), camera, exposure)
+
+    def _exposed(
+        self, rendered: Rendered, camera: PinholeCamera, exposure: NDArray[np.float32]
+    ) -> Rendered:
+        color = np.exp(exposure[0]) * rendered.color + exposure[1] * rendered.silhouette[..., None]
+        return replace(rendered, color=color * self.vignette.falloff(camera)[..., None])
+
+    def final_trajectory(self, online: Trajectory) -> Trajectory:
+        """Return poses with what mapping found out after it had answered tracking."""
+        self.history.refresh(self.keyframes)
+        return self.history.correct(online)
+
+    def view(
+        self,
+        stamp_ns: int,
+        T_world_camera: Pose,
+        camera: PinholeCamera,
+        exposure: NDArray[np.float32] | None = None,
+    ) -> ModelView:
         """Render what tracking gets back: the static map and its posterior, as topics carry it."""
-        static = self.render(T_world_camera, camera)
+        exposed = self.history.exposure(stamp_ns) if exposure is None else exposure
+        static = self._exposed(self.render(T_world_camera, camera), camera, exposed)
         known = static.silhouette > self._config.model.silhouette
         safe = np.maximum(static.silhouette, np.float32(1e-6))
         color = static.color / safe[..., None]
@@ -217,7 +292,8 @@ class Mapper:
             If something cannot be written; the old files are still there then.
 
         """
-        kept = KeyframeSet(self.keyframes, self.keyframe_stamps_ns, self._count)
+        self.history.refresh(self.keyframes)
+        kept = KeyframeSet(self.keyframes, self.history, self.vignette, self._count)
         save_map(Path(path), self.map, kept if keyframes else None)
 
     def load(self, path: Path) -> None:
@@ -234,7 +310,7 @@ class Mapper:
         self.reset()
         self.map = loaded
         self.keyframes = list(kept.keyframes)
-        self.keyframe_stamps_ns = list(kept.stamps_ns)
+        self.history, self.vignette = kept.history, kept.vignette
         self._count = kept.next_index
 
 

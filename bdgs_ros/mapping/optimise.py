@@ -11,10 +11,12 @@ from bdgs_ros.belief.fusion import State
 from bdgs_ros.core.config import MappingConfig
 from bdgs_ros.mapping import losses
 from bdgs_ros.mapping.gaussians import PARAMETERS, GaussianMap
-from bdgs_ros.mapping.keyframes import Level, MapKeyframe
+from bdgs_ros.mapping.keyframes import Level, MapKeyframe, Window
 from bdgs_ros.mapping.rasterize import FusedResult, LossWeights, adam_step, fused_step
 
 Array = NDArray[np.float32]
+
+_POSE_BETAS = (0.9, 0.99)  # a pose is seen in few steps, so the second moment must be fast
 
 
 class Optimiser:
@@ -23,8 +25,13 @@ class Optimiser:
     def __init__(self, config: MappingConfig) -> None:
         self._config = config
         self._weights = LossWeights(
-            color=config.loss.psim, ssim=config.loss.ssim, depth=config.loss.depth
+            color=config.loss.psim,
+            ssim=config.loss.ssim,
+            depth=config.loss.depth,
+            smooth=config.loss.smooth,
+            empty=config.loss.empty,
         )
+        self._rng = np.random.default_rng(config.seed)
         rate = config.rate
         self._rates = {
             'means': rate.means,
@@ -76,7 +83,7 @@ class Optimiser:
         gaussians : GaussianMap
             Changed in place.
         keyframe : MapKeyframe
-            The view; its exposure is adapted too.
+            The view; its exposure and pose are adapted too.
         level_index : int
             Of the keyframe's pyramid, 0 is the finest.
         rate_scale : float
@@ -111,14 +118,31 @@ class Optimiser:
         penalised: NDArray[np.bool_],
         rate_scale: float = 1.0,
     ) -> float:
-        level = keyframe.levels[level_index]
+        level = self._look(keyframe.levels[level_index])
         active = visible & self._opaque_enough(gaussians.logit_opacities, level_index)
         result = self._photometric(gaussians, keyframe, level, active)
         gradients = dict(zip(PARAMETERS, result.gradients.parameters(), strict=True))
         regulariser = self._add_direct_terms(gaussians, gradients, level, penalised)
         self._adam(gaussians, gradients, (result.visibility > 0) | penalised, rate_scale)
         self._adapt_exposure(keyframe, result.exposure_gradient, rate_scale)
+        self._adapt_pose(keyframe, result.gradients.pose, rate_scale)
         return result.loss + regulariser
+
+    def _look(self, level: Level) -> Level:
+        """Choose the window of a large image that this step sees; small ones it sees whole."""
+        height, width = level.camera.shape
+        share = np.sqrt(self._config.step_pixels / (height * width))
+        if share >= 1:
+            return level
+        rows, columns = (self._stretch(length, share) for length in (height, width))
+        return level.cut(Window(rows, columns))
+
+    def _stretch(self, length: int, share: float) -> slice:
+        """Return a random stretch; its ends reach beyond the image, so that rims are seen too."""
+        wanted = round(length * share)
+        anywhere = self._rng.integers(-wanted // 2, length - wanted // 2)
+        start = int(np.clip(anywhere, 0, length - wanted))
+        return slice(start, start + wanted)
 
     def _opaque_enough(self, logit_opacities: Array, level_index: int) -> NDArray[np.bool_]:
         """Eq. 13: alpha_g counts only above tau_i, which grows towards the coarse levels."""
@@ -190,3 +214,15 @@ class Optimiser:
         moments = keyframe.exposure_moments
         rate = rate_scale * self._config.rate.exposure
         adam_step(keyframe.exposure, gradient, *moments, rate=rate)
+
+    def _adapt_pose(
+        self, keyframe: MapKeyframe, gradient: NDArray[np.float64], rate_scale: float
+    ) -> None:
+        """Let a keyframe's pose follow the map; the first keyframe defines the world."""
+        if keyframe.index == 0:
+            return
+        xi = np.zeros(6, np.float32)
+        rate = rate_scale * self._config.rate.pose
+        first, second = keyframe.pose_moments
+        adam_step(xi, gradient.astype(np.float32), first, second, rate=rate, betas=_POSE_BETAS)
+        keyframe.move(xi)

@@ -209,6 +209,7 @@ class MappingNode(GraphNode):
         file = self._map_file()
         with self._lock:
             self._mapper.load(file)
+            self._mapper.history.begin_run()
             count = len(self._mapper.map)
         self._version += 1
         return f"{count} Gaussians from '{file}'"

@@ -97,7 +97,8 @@ def test_exposure_is_fitted_except_for_the_first_keyframe() -> None:
         gaussians, keyframe = scene()
         keyframe.index = index
         brighter = tuple(
-            replace(level, color=np.clip(1.3 * level.color, 0, 1)) for level in keyframe.levels
+            replace(level, image=np.clip(1.3 * level.image, 0, 255).astype(np.uint8))
+            for level in keyframe.levels
         )
         keyframe.levels = brighter
         Optimiser(CONFIG).run(gaussians, keyframe, [])

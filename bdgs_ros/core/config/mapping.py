@@ -15,7 +15,13 @@ class LossConfig:
     dynamic: float = param(0.15, 'lambda_dyn of Eq. 7', low=0.0)
     reg: float = param(1.0, 'lambda_reg of Eq. 7 on the squared norm of Sigma', low=0.0)
     ssim: float = param(0.2, 'gamma of Eq. 9', low=0.0, high=1.0)
-    depth: float = param(1.0, 'weight of the depth term', unit='1/m', low=0.0)
+    smooth: float = param(
+        0.0, 'lambda of the first term of Eq. 8, edge-aware', unit='1/m', low=0.0
+    )
+    depth: float = param(0.3, 'weight of the depth term', unit='1/m', low=0.0)
+    empty: float = param(
+        0.02, 'weight of what shines through where a surface was measured', low=0.0
+    )
 
 
 @dataclass(frozen=True)
@@ -28,6 +34,7 @@ class LearningRateConfig:
     opacities: float = param(0.05, 'logit opacities', low=0.0)
     colors: float = param(0.005, 'colours', low=0.0)
     exposure: float = param(0.002, 'log gain and offset of a keyframe', low=0.0)
+    pose: float = param(0.0005, 'pose of a keyframe', unit='m and rad', low=0.0)
 
 
 @dataclass(frozen=True)
@@ -103,7 +110,13 @@ class MappingConfig:
     """The Gaussian map and its optimisation."""
 
     enabled: bool = param(True, 'without it tracking is keyframe odometry (Table 6)')
-    width: int = param(320, 'image width at which the map is optimised', unit='px', low=40)
+    width: int = param(640, 'image width at which the map is optimised', unit='px', low=40)
+    growth_width: int = param(
+        320, 'image width at which beliefs are updated and Gaussians added', unit='px', low=40
+    )
+    step_pixels: int = param(
+        76800, 'of a larger image, one step sees a window of this many', unit='px', low=400
+    )
     iterations: int = param(40, 'optimisation steps per keyframe', low=0, high=1000)
     window: int = param(8, 'newest keyframes in every optimisation', low=1, high=64)
     keyframes: int = param(

@@ -1,0 +1,148 @@
+"""
+What became of the keyframes: how late corrections reach the frames between them.
+
+Frames are tracked against the view of a keyframe. When the map later moves that keyframe, they
+move with it; between two keyframes the corrections of both are blended.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bdgs_ros.core import se3
+from bdgs_ros.core.types import Pose, StampedPose, Trajectory
+from bdgs_ros.mapping.keyframes import MapKeyframe
+
+Array = NDArray[np.float32]
+
+_POSES = ('online', 'tracked', 'final')
+
+
+@dataclass
+class Anchor:
+    """One keyframe's poses, `T_world_camera`, and its exposure."""
+
+    online: Pose
+    """As tracking gave it."""
+    tracked: Pose
+    """When its view was given to tracking."""
+    final: Pose
+    exposure: Array
+
+
+class History:
+    """All keyframes that ever were, also those whose images are forgotten."""
+
+    def __init__(self) -> None:
+        self._anchors: dict[int, Anchor] = {}
+        self._earlier_ns: list[int] = []
+
+    @property
+    def stamps_ns(self) -> list[int]:
+        """Of all frames that the map was ever fitted to."""
+        return [*self._earlier_ns, *self._anchors]
+
+    def begin_run(self) -> None:
+        """Keep of earlier runs nothing but the stamps: their poses correct no new frame."""
+        self._earlier_ns, self._anchors = self.stamps_ns, {}
+
+    def add(self, keyframe: MapKeyframe) -> None:
+        """Take a keyframe as tracking gave it."""
+        pose = keyframe.T_world_camera
+        self._anchors[keyframe.stamp_ns] = Anchor(pose, pose, pose, keyframe.exposure.copy())
+
+    def publish(self, keyframe: MapKeyframe) -> None:
+        """Note that tracking now gets the view of a keyframe from where it is."""
+        self._anchors[keyframe.stamp_ns].tracked = keyframe.T_world_camera
+
+    def refresh(self, keyframes: Iterable[MapKeyframe]) -> None:
+        """Take over the present poses and exposures."""
+        for keyframe in keyframes:
+            anchor = self._anchors.get(keyframe.stamp_ns)
+            if anchor is not None:
+                anchor.final = keyframe.T_world_camera
+                anchor.exposure = keyframe.exposure.copy()
+
+    def exposure(self, stamp_ns: int) -> Array:
+        """Return (log gain, offset) at a time, blended between the keyframes around it."""
+        if not self._anchors:
+            return np.zeros(2, np.float32)
+        before, after, share = self._around(stamp_ns)
+        first, second = self._anchors[before].exposure, self._anchors[after].exposure
+        return np.asarray((1 - share) * first + share * second, np.float32)
+
+    def correct(self, online: Trajectory) -> Trajectory:
+        """
+        Return the trajectory with what mapping found out later.
+
+        Parameters
+        ----------
+        online : Trajectory
+            As tracking gave it.
+
+        Returns
+        -------
+        final : Trajectory
+            The same stamps; the same poses where there are no keyframes.
+
+        """
+        if not self._anchors:
+            return online
+        return Trajectory(
+            tuple(
+                StampedPose(pose.stamp_ns, self._correction(pose.stamp_ns) @ pose.T_world_camera)
+                for pose in online.poses
+            )
+        )
+
+    def _correction(self, stamp_ns: int) -> Pose:
+        """Return T_final_online at a time."""
+        before, after, share = self._around(stamp_ns)
+        own = self._anchors[before]
+        if stamp_ns <= before:
+            return own.final @ se3.inverse(own.online)
+        held = own.final @ se3.inverse(own.tracked)
+        if after == before:
+            return held
+        next_one = self._anchors[after]
+        coming = next_one.final @ se3.inverse(next_one.online)
+        step = se3.log(coming @ se3.inverse(held))
+        return se3.orthonormalise(se3.exp(share * step) @ held)
+
+    def _around(self, stamp_ns: int) -> tuple[int, int, float]:
+        """Return the keyframes before and after a time, and how far between them it lies."""
+        stamps = sorted(self._anchors)
+        place = bisect_right(stamps, stamp_ns)
+        before = stamps[max(place - 1, 0)]
+        after = stamps[min(place, len(stamps) - 1)]
+        share = (stamp_ns - before) / (after - before) if after > before else 0.0
+        return before, after, float(np.clip(share, 0, 1))
+
+    def to_document(self) -> dict[str, Any]:
+        """Return everything as plain numbers."""
+        anchors = [
+            {
+                'stamp_ns': stamp_ns,
+                'exposure': [float(value) for value in anchor.exposure],
+                **{name: getattr(anchor, name).tolist() for name in _POSES},
+            }
+            for stamp_ns, anchor in self._anchors.items()
+        ]
+        return {'anchors': anchors, 'earlier_ns': self._earlier_ns}
+
+    @classmethod
+    def from_document(cls, document: dict[str, Any]) -> History:
+        """Undo `to_document`; KeyError, TypeError or ValueError if it is something else."""
+        history = cls()
+        history._earlier_ns = [int(stamp) for stamp in document['earlier_ns']]
+        for entry in document['anchors']:
+            online, tracked, final = (np.array(entry[n], float).reshape(4, 4) for n in _POSES)
+            exposure = np.array(entry['exposure'], np.float32).reshape(2)
+            history._anchors[int(entry['stamp_ns'])] = Anchor(online, tracked, final, exposure)
+        return history
