@@ -32,6 +32,7 @@ _log = logging.getLogger(__name__)
 
 _START_SIGMA_M = 0.3  # how well the start in a known map is known
 _START_SIGMA_RAD = 0.3
+_MOST_TRACKED = 32  # keyframes; mapping that is further behind corrects nothing
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,7 @@ class CameraTracker:
         """Forget everything; the next frame is the first, and the origin of the world."""
         self._keyframe: Reference | None = None
         self._model: Reference | None = None
+        self._tracked: dict[int, Pose] = {}  # keyframes whose view has not come yet
         self._keyframe_depth_m = 1.0
         self._frames_since_keyframe = 0
         self._world_is_known = False
@@ -92,11 +94,30 @@ class CameraTracker:
         self._world_is_known = True
 
     def set_model(self, view: ModelView | None) -> None:
-        """Take the static map as rendered at a keyframe, or None where there is no map."""
+        """
+        Take the static map as rendered at a keyframe, or None where there is no map.
+
+        Mapping may have moved the keyframe a little; all that was tracked since moves with it.
+        """
         if view is None:
             return
+        self._follow(view)
         pyramid = self._aligner.pyramid(view.color, view.depth_m, view.p_dynamic, view.camera)
         self._model = Reference(view.T_world_camera, pyramid)
+
+    def _follow(self, view: ModelView) -> None:
+        tracked = self._tracked.get(view.stamp_ns)
+        if tracked is None or self._keyframe is None:
+            return
+        T_new_old = se3.orthonormalise(view.T_world_camera @ se3.inverse(tracked))
+        self._motion.move(T_new_old)
+        moved = T_new_old @ self._keyframe.T_world_camera
+        self._keyframe = replace(self._keyframe, T_world_camera=moved)
+        self._tracked = {
+            stamp_ns: T_new_old @ pose
+            for stamp_ns, pose in self._tracked.items()
+            if stamp_ns >= view.stamp_ns
+        }
 
     def process(self, frame: RgbdFrame, labels: Labels | None = None) -> TrackingResult:
         """
@@ -300,6 +321,9 @@ class CameraTracker:
         self, frame: RgbdFrame, T_world_camera: Pose, pyramid: ImagePyramid
     ) -> None:
         self._keyframe = Reference(T_world_camera, pyramid)
+        self._tracked[frame.stamp_ns] = T_world_camera
+        if len(self._tracked) > _MOST_TRACKED:
+            del self._tracked[min(self._tracked)]
         self._keyframe_depth_m = _median_depth(frame.depth_m)
         self._frames_since_keyframe = 0
 

@@ -10,7 +10,7 @@ zero after every update, when it is folded into the pose.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
@@ -115,6 +115,12 @@ class MotionPredictor:
             self._state = self._start(stamp_ns, measured, noise)
             return
         self._state = self._correct(predicted, innovation, noise)
+
+    def move(self, T_new_old: Pose) -> None:
+        """Follow a correction of the world, `T_new_camera = T_new_old @ T_old_camera`."""
+        if self._state is not None:
+            moved = se3.orthonormalise(T_new_old @ self._state.T_world_camera)
+            self._state = replace(self._state, T_world_camera=moved)
 
     def _start(self, stamp_ns: int, T_world_camera: Pose, noise: Matrix) -> _State:
         covariance = self._start_covariance()
