@@ -18,7 +18,7 @@ import numpy as np
 from bdgs_ros.core.config import BdgsConfig, MappingConfig
 from bdgs_ros.core.errors import ConfigError, EvaluationError, MapError
 from bdgs_ros.core.files import write_text
-from bdgs_ros.data.trajectory_io import read_trajectory
+from bdgs_ros.data.trajectory_io import read_trajectory, write_trajectory
 from bdgs_ros.eval import pictures, scores
 from bdgs_ros.eval.metric import Metric, as_dict, dump_json
 from bdgs_ros.runner import map_metrics, metrics_document
@@ -255,6 +255,8 @@ class _Views:
         if self._trajectory_file.is_file():
             text = self._trajectory_file.read_text(encoding='utf-8')
             write_text(folder / 'trajectory.txt', text)
+            final = self._mapper.final_trajectory(read_trajectory(self._trajectory_file))
+            write_trajectory(folder / 'trajectory_final.txt', final)
         if self._samples:
             pictures.write_tiles(folder / 'tiles.png', self._render())
 

@@ -49,6 +49,9 @@ class Slam(Protocol):
 class StaticMap(scores.Renderer, Protocol):
     """The map at the end of a run; see `bdgs_ros.mapping.mapper.Mapper`."""
 
+    def final_trajectory(self, online: Trajectory) -> Trajectory:
+        """Return poses with what mapping found out later."""
+
     def save(self, path: Path, *, keyframes: bool = True) -> None:
         """Write the Gaussians as .ply and, if wanted, the keyframes beside it."""
 
@@ -158,7 +161,8 @@ def write_results(
     Parameters
     ----------
     folder : Path
-        Gets `trajectory.txt` (TUM), `map.ply`, `map_keyframes`, `metrics.json`, and the pictures
+        Gets `trajectory.txt` (TUM, as tracking gave it), `trajectory_final.txt` (with what
+        mapping found out later), `map.ply`, `map_keyframes`, `metrics.json`, and the pictures
         `tiles.png`, `animation.gif` and `trajectory.png`.
     result : RunResult
         What `run_sequence` or a `Recorder` collected.
@@ -211,6 +215,9 @@ def write_results(
         if save_map:
             static_map.save(folder / 'map.ply', keyframes=keep_keyframes)
         found += map_metrics(folder / 'map.ply')
+        final = static_map.final_trajectory(est)
+        write_trajectory(folder / 'trajectory_final.txt', final)
+        found += _final_metrics(final, ground_truth, ate)
         views = scores.render_samples(result.samples, static_map)
         found += scores.render_metrics(views, truth)
     if with_pictures:
@@ -241,6 +248,19 @@ def _trajectory_metrics(
         return scores.trajectory_metrics(gt, est, expected)
     share = 100.0 * len(est) / expected if expected else float('nan')
     return [Metric('coverage', share, '%'), Metric('frames', len(est))]
+
+
+def _final_metrics(
+    final: Trajectory, gt: Trajectory | None, online: trajectory.AteResult | None
+) -> list[Metric]:
+    """Return the error of the final trajectory where that of the online one is known."""
+    if gt is None or online is None:
+        return []
+    errors = trajectory.ate(gt, final).statistics
+    return [
+        Metric('ate_final_rmse', 100.0 * errors.rmse, 'cm'),
+        Metric('ate_final_max', 100.0 * errors.max, 'cm'),
+    ]
 
 
 def map_metrics(path: Path) -> list[Metric]:

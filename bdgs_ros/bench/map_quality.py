@@ -107,7 +107,7 @@ class Scorer:
         found = scores.score_view(view, self.truth, perceptual=self.perceptual)
         if self.truth is None:
             color = view.sample.frame.color
-            found['psnr_boxes'] = rendering.psnr(view.color, color, frame.outside_boxes)
+            found['psnr_boxes'] = rendering.psnr(view.photo, color, frame.outside_boxes)
             found['counted'] = 100.0 * float(view.sample.static.mean())
         return found
 
@@ -209,6 +209,7 @@ _COLUMNS = {
     'psnr_seen': 'psnr_seen_db',
     'psnr_hidden': 'psnr_hidden_db',
     'psnr_boxes': 'psnr_boxes_db',
+    'psnr_map': 'psnr_map_db',
     'ssim': 'ssim',
     'lpips': 'lpips',
     'depth_l1': 'depth_l1_cm',

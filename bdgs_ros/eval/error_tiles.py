@@ -65,9 +65,10 @@ def write_error_tiles(
 
 def _row(view: View, truth: Truth | None, width: int, max_depth_m: float) -> ColorImage:
     frame = view.sample.frame
-    render = np.clip(view.color * 255.0 + 0.5, 0, 255).astype(np.uint8)
+    shown = view.photo if truth is None else view.color
+    render = np.clip(shown * 255.0 + 0.5, 0, 255).astype(np.uint8)
     target = frame.color if truth is None else truth.static_color(frame.stamp_ns)
-    error = np.abs(view.color - target.astype(np.float32) / 255.0).mean(axis=2) / _MAX_ERROR
+    error = np.abs(shown - target.astype(np.float32) / 255.0).mean(axis=2) / _MAX_ERROR
     heat = _colored(error, cv2.COLORMAP_INFERNO)
     if truth is None:
         heat[~view.sample.static] = _UNCOUNTED

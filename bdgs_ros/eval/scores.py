@@ -50,6 +50,12 @@ class Renderer(Protocol):
     def render(self, T_world_camera: Pose, camera: PinholeCamera) -> Render:
         """Show the static map from a pose."""
 
+    def as_photograph(self, rendered: Any, camera: PinholeCamera, stamp_ns: int) -> Render:
+        """Return a render as the camera would show it then: its exposure, its lens's falloff."""
+
+    def final_pose(self, stamp_ns: int, T_world_camera: Pose) -> Pose:
+        """Return a pose with what mapping found out after tracking gave it."""
+
 
 class Truth(Protocol):
     """What a synthetic recording knows about each of its frames."""
@@ -70,21 +76,27 @@ class View:
 
     sample: Sample
     color: NDArray[np.float32]
+    """As the map has it."""
+    photo: NDArray[np.float32]
+    """As the camera would show it, by the exposure of the keyframes around."""
     depth_m: NDArray[np.float32]
     """Expected depth; 0 where the map is empty."""
     silhouette: NDArray[np.float32]
 
 
 def render_view(sample: Sample, renderer: Renderer) -> View:
-    """Render the static map, as it is now, at the estimated pose of a sample."""
-    render = renderer.render(sample.T_world_camera, sample.frame.camera)
+    """Render the static map, as it is now, at what is now known to be the pose of a sample."""
+    frame = sample.frame
+    pose = renderer.final_pose(frame.stamp_ns, sample.T_world_camera)
+    render = renderer.render(pose, frame.camera)
+    photo = renderer.as_photograph(render, frame.camera, frame.stamp_ns)
     seen = render.silhouette > _SEEN
     depth_m = np.where(seen, render.depth / np.maximum(render.silhouette, _SEEN), 0.0)
-    return View(sample, render.color, depth_m.astype(np.float32), render.silhouette)
+    return View(sample, render.color, photo.color, depth_m.astype(np.float32), render.silhouette)
 
 
 def render_samples(samples: Sequence[Sample], renderer: Renderer) -> list[View]:
-    """Render the final static map at the estimated pose of every sample."""
+    """Render the final static map at the final pose of every sample."""
     return [render_view(sample, renderer) for sample in samples]
 
 
@@ -169,7 +181,8 @@ def score_view(
         return _against_truth(view, truth, perceptual)
     counted = view.sample.static if static is None else static
     frame: RgbdFrame = view.sample.frame
-    return _scores(view, frame.color, frame.depth_m, counted, perceptual)
+    scores = _scores(view, view.photo, (frame.color, frame.depth_m), counted, perceptual)
+    return {**scores, 'psnr_map': rendering.psnr(view.color, frame.color, counted)}
 
 
 def mean_scores(scores: Sequence[Mapping[str, float]]) -> list[Metric]:
@@ -189,6 +202,7 @@ _UNITS = {
     'psnr_exposure_fit': 'dB',
     'psnr_seen': 'dB',
     'psnr_hidden': 'dB',
+    'psnr_map': 'dB',
     'ssim': '',
     'lpips': '',
     'depth_l1': 'cm',
@@ -199,30 +213,32 @@ _UNITS = {
 def _against_truth(view: View, truth: Truth, perceptual: Perceptual | None) -> dict[str, float]:
     stamp_ns = view.sample.frame.stamp_ns
     hidden = np.asarray(truth.dynamic(stamp_ns), dtype=bool)
-    color, depth = truth.static_color(stamp_ns), truth.static_depth(stamp_ns)
-    scores = _scores(view, color, depth, np.ones(hidden.shape, dtype=bool), perceptual)
-    return {**scores, 'psnr_hidden': rendering.psnr(view.color, color, hidden)}
+    wanted = truth.static_color(stamp_ns), truth.static_depth(stamp_ns)
+    everything = np.ones(hidden.shape, dtype=bool)
+    scores = _scores(view, view.color, wanted, everything, perceptual)
+    return {**scores, 'psnr_hidden': rendering.psnr(view.color, wanted[0], hidden)}
 
 
 def _scores(
     view: View,
-    color: ColorImage,
-    depth: DepthImage,
+    shown: NDArray[np.float32],
+    wanted: tuple[ColorImage, DepthImage],
     valid: NDArray[np.bool_],
     perceptual: Perceptual | None,
 ) -> dict[str, float]:
-    fitted = rendering.fit_exposure(view.color, color, valid)
+    color, depth = wanted
+    fitted = rendering.fit_exposure(shown, color, valid)
     seen = view.silhouette > _SEEN
     scores = {
-        'psnr': rendering.psnr(view.color, color, valid),
+        'psnr': rendering.psnr(shown, color, valid),
         'psnr_exposure_fit': rendering.psnr(fitted, color, valid),
-        'psnr_seen': rendering.psnr(view.color, color, valid & seen),
-        'ssim': rendering.ssim(view.color, color, valid),
+        'psnr_seen': rendering.psnr(shown, color, valid & seen),
+        'ssim': rendering.ssim(shown, color, valid),
         'depth_l1': 100.0 * rendering.depth_l1(view.depth_m, depth, valid),
         'seen': 100.0 * float(np.mean(seen)),
     }
     if perceptual is not None:
-        scores['lpips'] = perceptual(view.color, color, valid)
+        scores['lpips'] = perceptual(shown, color, valid)
     return scores
 
 

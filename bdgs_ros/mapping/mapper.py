@@ -20,6 +20,7 @@ from bdgs_ros.core.types import (
     Pose,
     ProbabilityImage,
     RgbdFrame,
+    StampedPose,
     Trajectory,
 )
 from bdgs_ros.mapping import growth
@@ -232,15 +233,14 @@ class Mapper:
             window = window + [older[i] for i in chosen]
         return [window[i] for i in self._rng.permutation(len(window))]
 
-    def photograph(self, T_world_camera: Pose, camera: PinholeCamera, stamp_ns: int) -> Rendered:
+    def as_photograph(self, rendered: Rendered, camera: PinholeCamera, stamp_ns: int) -> Rendered:
         """
-        Render the static map as the camera would show it at a time: exposed, and with falloff.
+        Return a render as the camera would show it at a time: exposed, and with falloff.
 
         The exposure is blended between the keyframes around that time.
         """
         self.history.refresh(self.keyframes)
-        exposure = self.history.exposure(stamp_ns)
-        return self._exposed(self.render(T_world_camera, camera), camera, exposure)
+        return self._exposed(rendered, camera, self.history.exposure(stamp_ns))
 
     def _exposed(
         self, rendered: Rendered, camera: PinholeCamera, exposure: NDArray[np.float32]
@@ -252,6 +252,11 @@ class Mapper:
         """Return poses with what mapping found out after it had answered tracking."""
         self.history.refresh(self.keyframes)
         return self.history.correct(online)
+
+    def final_pose(self, stamp_ns: int, T_world_camera: Pose) -> Pose:
+        """Return one pose of `final_trajectory`."""
+        online = Trajectory((StampedPose(stamp_ns, T_world_camera),))
+        return self.final_trajectory(online).poses[0].T_world_camera
 
     def view(
         self,

@@ -18,6 +18,7 @@ from bdgs_ros.core.types import (
     TrackingStatus,
     Trajectory,
 )
+from bdgs_ros.mapping.history import History
 
 CAMERA = PinholeCamera(32, 24, 30.0, 30.0, 15.5, 11.5)
 PERIOD_NS = 33_333_333
@@ -82,6 +83,7 @@ class FakeRender:
     silhouette: np.ndarray
 
 
+@dataclass
 class FakeMapper:
     """Shows the true wall, one grey level off."""
 
@@ -94,7 +96,18 @@ class FakeMapper:
             color, np.full(camera.shape, 2.1, np.float32), np.ones(camera.shape, np.float32)
         )
 
-    keyframe_stamps_ns: tuple[int, ...] = ()
+    history: History = field(default_factory=History)
+
+    def as_photograph(
+        self, rendered: FakeRender, camera: PinholeCamera, stamp_ns: int
+    ) -> FakeRender:
+        return rendered
+
+    def final_pose(self, stamp_ns: int, T_world_camera: np.ndarray) -> np.ndarray:
+        return T_world_camera
+
+    def final_trajectory(self, online: Trajectory) -> Trajectory:
+        return online
 
     def save(self, path: Path, *, keyframes: bool = True) -> None:
         path.write_bytes(b'ply\nformat binary_little_endian 1.0\nelement vertex 7\nend_header\n')

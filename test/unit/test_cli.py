@@ -164,6 +164,7 @@ def test_run_writes_results_and_prints_them(monkeypatch, tmp_path, capsys):
         'map.ply',
         'metrics.json',
         'trajectory.txt',
+        'trajectory_final.txt',
     }
     assert main.main([*words, '--frames', '30']) == 2
     assert 'frames 0 to 30' in capsys.readouterr().err

@@ -30,7 +30,7 @@ class FakeDetection:
 
 class LoadedMapper(FakeMapper):
     def __init__(self, mapping, belief):
-        pass
+        super().__init__()
 
     def load(self, path):
         assert path.is_file()

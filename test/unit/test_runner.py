@@ -84,6 +84,7 @@ def test_results_are_complete(run, tmp_path):
     made = {p.name for p in (tmp_path / 'out').iterdir()}
     assert made == {
         'trajectory.txt',
+        'trajectory_final.txt',
         'map.ply',
         'metrics.json',
         'tiles.png',
