@@ -63,10 +63,17 @@ constexpr int kBlocksX = kTile / kBlockWidth, kBlocksY = kTile / kBlockHeight;
 constexpr int kBlocks = kBlocksX * kBlocksY;
 constexpr float kMaxAlpha = 0.99f, kMinTransmittance = 1e-4f;
 constexpr float kTileCentre = 0.5f * (kTile - 1);
-constexpr int kOutputs = 16;  // floats per slot: 8 for g, 8 for w
+constexpr int kOutputs = 16;  // floats per slot
+constexpr int kBatch = 8;     // pairs walked before their products are formed
 constexpr uint32_t kCulled = 0xffffffffu;
 constexpr int kAhead = 24;     // how many elements ahead of its use memory is asked for
 constexpr int kRadixBits = 12, kRadix = 1 << kRadixBits;
+
+// What the pixels of a slot add up to: sums over g at even places, over w at odd ones.
+enum Output {
+  kG = 0, kGx = 2, kGy = 4, kGxx = 6, kGxy = 8, kGyy = 10,
+  kSumRed = 1, kSumDepth = 7, kSumDepthX = 9, kSumDepthY = 11, kSumWeight = 13
+};
 
 struct Box {  // pixels, inclusive
   uint16_t x0, x1, y0, y1;
@@ -318,14 +325,14 @@ class Rasterizer {
 
   // first_slot_[i] .. first_slot_[i + 1] are Gaussian i's places in slots_of_.
   void number_slots(int count) {
-    first_slot_.reserve(count + 2 * kLanes + 1);
+    first_slot_.reserve(count + 3 * kLanes + 1);
     slot_next_.reserve(count + 1);
     uint32_t used = 0;
     for (int i = 0; i < count; ++i) {
       first_slot_[i] = slot_next_[i] = used;
       used += keys_[i] == kCulled ? 0 : boxes_[i].tiles();
     }
-    std::fill_n(first_slot_.data() + count, 2 * kLanes + 1, used);
+    std::fill_n(first_slot_.data() + count, 3 * kLanes + 1, used);
     slots_ = used;
   }
 
@@ -546,9 +553,10 @@ class Rasterizer {
     const Lanes g_silhouette = load_block(plane(kGradSilhouette) + at);
     const Lanes px = pixel_x(block), py = pixel_y(block);
     const Lanes g_depth_x = g_depth * px, g_depth_y = g_depth * py;
-    const Lanes columns[kOutputs] = {
-        splat(1.0f), px,      py,     px * px, px * py,   py * py,   Lanes{},     Lanes{},
-        g_red,       g_green, g_blue, g_depth, g_depth_x, g_depth_y, splat(1.0f), Lanes{}};
+    const Lanes one = splat(1.0f), none = Lanes{};
+    const Lanes columns[kOutputs] = {one,     g_red,   px,      g_green,   py,      g_blue,
+                                     px * px, g_depth, px * py, g_depth_x, py * py, g_depth_y,
+                                     none,    one,     none,    none};
     Matrix matrix;
     for (int k = 0; k < kOutputs; k += kLanes) transpose(columns + k, matrix.row[0] + k, kOutputs);
     Lanes rest = g_red * load_block(plane(kRed) + at) + g_green * load_block(plane(kGreen) + at) +
@@ -558,63 +566,55 @@ class Rasterizer {
     Lanes T = splat(1.0f);
     const float* alphas = arenas_[kept.thread].alphas.data() + kept.first * kLanes;
     const uint32_t* locals = arenas_[kept.thread].locals.data() + kept.first;
-    for (uint32_t k = 0; k < kept.count; ++k) {
-      const Record& r = records[locals[k]];
-      const Lanes alpha = load(alphas + static_cast<size_t>(k) * kLanes);
-      const Lanes w = alpha * T;
-      const Lanes u = g_red * r.red + g_green * r.green + g_blue * r.blue + g_depth * r.z +
-                      g_depth_x * r.zeta_u + g_depth_y * r.zeta_v + g_silhouette;
-      rest -= w * u;
-      // g = alpha dL/dalpha; a clamped alpha does not move with the Gaussian
-      Lanes g = w * u - alpha * rest * reciprocal(1.0f - alpha);
-      g = alpha < kMaxAlpha ? g : Lanes{};
-      T -= w;
-      add_product(matrix, g, w, sums + static_cast<size_t>(locals[k]) * kOutputs);
+    // Walking hangs on T and R from pair to pair, products on nothing: in turns, not together.
+    alignas(64) double pairs[kBatch][kLanes];
+    for (uint32_t done = 0; done < kept.count; done += kBatch) {
+      const uint32_t n = std::min<uint32_t>(kBatch, kept.count - done);
+      for (uint32_t k = 0; k < n; ++k) {
+        const Record& r = records[locals[done + k]];
+        const Lanes alpha = load(alphas + static_cast<size_t>(done + k) * kLanes);
+        const Lanes w = alpha * T;
+        const Lanes u = g_red * r.red + g_green * r.green + g_blue * r.blue + g_depth * r.z +
+                        g_depth_x * r.zeta_u + g_depth_y * r.zeta_v + g_silhouette;
+        rest -= w * u;
+        // g = alpha dL/dalpha; a clamped alpha does not move with the Gaussian
+        Lanes g = w * u - alpha * rest * reciprocal(1.0f - alpha);
+        g = alpha < kMaxAlpha ? g : Lanes{};
+        T -= w;
+        interleave(g, w, pairs[k]);
+      }
+      for (uint32_t k = 0; k < n; ++k)
+        add_product(matrix, pairs[k], sums + static_cast<size_t>(locals[done + k]) * kOutputs);
     }
   }
 
-  // out[0..7] += g . matrix[:, 0..7],  out[8..15] += w . matrix[:, 8..15]
-  static void add_product(const Matrix& matrix, Lanes g, Lanes w, float* out) {
-#if defined(__AVX512F__)
-    // lanes 0-7 of `near` and `far` are g of the first and last eight pixels, lanes 8-15 are w
-    const __m512 near = _mm512_shuffle_f32x4(reinterpret_cast<__m512>(g),
-                                             reinterpret_cast<__m512>(w), 0x44);
-    const __m512 far = _mm512_shuffle_f32x4(reinterpret_cast<__m512>(g),
-                                            reinterpret_cast<__m512>(w), 0xee);
-    __m512 sum = _mm512_load_ps(out), more = _mm512_setzero_ps();
-#pragma GCC unroll 8
-    for (int l = 0; l < 8; ++l) {
-      const __m512i pick = _mm512_setr_epi32(l, l, l, l, l, l, l, l, 8 + l, 8 + l, 8 + l, 8 + l,
-                                             8 + l, 8 + l, 8 + l, 8 + l);
-      sum = _mm512_fmadd_ps(_mm512_permutexvar_ps(pick, near), _mm512_load_ps(matrix.row[l]), sum);
-      more =
-          _mm512_fmadd_ps(_mm512_permutexvar_ps(pick, far), _mm512_load_ps(matrix.row[8 + l]), more);
-    }
-    _mm512_store_ps(out, _mm512_add_ps(sum, more));
-#else
-    Lanes of_g = load(out), of_w = load(out + 8);
-#pragma GCC unroll 8
+  // out += g . matrix at even places, w . matrix at odd ones.
+  static void add_product(const Matrix& matrix, const double* pairs, float* out) {
+    constexpr int kParts = kOutputs / kLanes;
+    Lanes sums[kParts], more[kParts] = {};
+    for (int part = 0; part < kParts; ++part) sums[part] = load(out + part * kLanes);
+#pragma GCC unroll 16
     for (int l = 0; l < kLanes; ++l) {
-      of_g += g[l] * load(matrix.row[l]);
-      of_w += w[l] * load(matrix.row[l] + 8);
+      const Lanes pair = splat_pair(pairs[pair_place(l)]);
+      Lanes* to = l < kLanes / 2 ? sums : more;
+      for (int part = 0; part < kParts; ++part)
+        to[part] += pair * load(matrix.row[l] + part * kLanes);
     }
-    store(out, of_g);
-    store(out + 8, of_w);
-#endif
+    for (int part = 0; part < kParts; ++part)
+      store(out + part * kLanes, sums[part] + more[part]);
   }
 
   // Moments about the tile's centre to moments about the Gaussian's.
   static void centre_moments(const float* in, const Record& r, float* out) {
-    const float g = in[0], x = in[1], y = in[2], u = r.u, v = r.v;
-    out[0] = g;
-    out[1] = x - u * g;
-    out[2] = y - v * g;
-    out[3] = in[3] - u * (2.0f * x - u * g);
-    out[4] = in[4] - u * y - v * (x - u * g);
-    out[5] = in[5] - v * (2.0f * y - v * g);
-    std::memcpy(out + 6, in + 6, 10 * sizeof(float));
-    out[12] = in[12] - u * in[11];
-    out[13] = in[13] - v * in[11];
+    const float g = in[kG], x = in[kGx], y = in[kGy], u = r.u, v = r.v;
+    std::memcpy(out, in, kOutputs * sizeof(float));
+    out[kGx] = x - u * g;
+    out[kGy] = y - v * g;
+    out[kGxx] = in[kGxx] - u * (2.0f * x - u * g);
+    out[kGxy] = in[kGxy] - u * y - v * (x - u * g);
+    out[kGyy] = in[kGyy] - v * (2.0f * y - v * g);
+    out[kSumDepthX] = in[kSumDepthX] - u * in[kSumDepth];
+    out[kSumDepthY] = in[kSumDepthY] - v * in[kSumDepth];
   }
 
   // ---- gather ----------------------------------------------------------------------------------
@@ -639,7 +639,7 @@ class Rasterizer {
   // Sum the slots of Gaussians i .. i + kLanes - 1; false if none has any.
   bool sum_slots(int i, Moments& m) {
     // first_slot_ goes on beyond the last Gaussian
-    for (uint32_t s = first_slot_[i + kLanes]; s < first_slot_[i + 2 * kLanes]; ++s)
+    for (uint32_t s = first_slot_[i + 2 * kLanes]; s < first_slot_[i + 3 * kLanes]; ++s)
       __builtin_prefetch(&slot_sums_[static_cast<size_t>(slots_of_[s]) * kOutputs]);
     if (first_slot_[i] == first_slot_[i + kLanes]) return false;
     constexpr int kParts = kOutputs / kLanes;
@@ -655,24 +655,24 @@ class Rasterizer {
     alignas(64) float columns[kOutputs][kLanes];
     for (int part = 0; part < kParts; ++part)
       transpose(sums[part], columns[part * kLanes], kLanes);
-    m.g = load(columns[0]);
-    m.gx = load(columns[1]);
-    m.gy = load(columns[2]);
-    m.gxx = load(columns[3]);
-    m.gxy = load(columns[4]);
-    m.gyy = load(columns[5]);
-    for (int k = 0; k < 3; ++k) m.color[k] = load(columns[8 + k]);
-    m.depth = load(columns[11]);
-    m.depth_x = load(columns[12]);
-    m.depth_y = load(columns[13]);
-    m.weight = load(columns[14]);
+    m.g = load(columns[kG]);
+    m.gx = load(columns[kGx]);
+    m.gy = load(columns[kGy]);
+    m.gxx = load(columns[kGxx]);
+    m.gxy = load(columns[kGxy]);
+    m.gyy = load(columns[kGyy]);
+    for (int k = 0; k < 3; ++k) m.color[k] = load(columns[kSumRed + 2 * k]);
+    m.depth = load(columns[kSumDepth]);
+    m.depth_x = load(columns[kSumDepthX]);
+    m.depth_y = load(columns[kSumDepthY]);
+    m.weight = load(columns[kSumWeight]);
     return true;
   }
 
   void gather_group(const Parameters& in, const View& view, int i, const GradientArrays& out,
                     double* pose) {
-    Moments m = {};
-    ParameterGradients d = {};
+    Moments m;
+    ParameterGradients d;
     if (sum_slots(i, m)) {
       Ellipses e;
       transform_means(in, i, view, e);
@@ -685,6 +685,9 @@ class Rasterizer {
       Lanes* all = reinterpret_cast<Lanes*>(&d);
       for (size_t k = 0; k < sizeof(d) / sizeof(Lanes); ++k) all[k] = seen ? all[k] : Lanes{};
       for (int k = 0; k < 6; ++k) pose[k] += sum(d.pose[k]);
+    } else {
+      m = Moments{};
+      d = ParameterGradients{};
     }
     store_rows<3>(out.means, i, in.count, d.mean);
     store_rows<4>(out.quats, i, in.count, d.quat);
@@ -772,10 +775,9 @@ void copy_rendered(Rasterizer& r, const py::tuple& images, int threads) {
     const float *red = r.plane(kRed) + layout.at(y, 0), *green = r.plane(kGreen) + layout.at(y, 0),
                 *blue = r.plane(kBlue) + layout.at(y, 0);
     float* row = color + static_cast<size_t>(y) * layout.width * 3;
-    for (int x = 0; x < layout.width; ++x) {
-      row[3 * x] = red[x];
-      row[3 * x + 1] = green[x];
-      row[3 * x + 2] = blue[x];
+    for (int x = 0; x < layout.width; x += kLanes) {
+      const Lanes columns[3] = {load(red + x), load(green + x), load(blue + x)};
+      store_rows<3>(row, x, layout.width, columns);
     }
     for (int k = 0; k < 3; ++k)
       std::memcpy(others[k] + static_cast<size_t>(y) * layout.width,

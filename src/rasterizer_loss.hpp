@@ -148,20 +148,17 @@ class Loss {
     const float* weight = in_.weight + static_cast<size_t>(y) * width;
     const float* pixels = in_.color + static_cast<size_t>(y) * width * 3;
     float *w = plane(kWeight, y), *depth = plane(kTargetDepth, y);
-    float *red = plane(kTarget, y), *green = plane(kTarget + 1, y), *blue = plane(kTarget + 2, y);
     for (int x = 0; x < width; ++x) w[x] = weight[x] > 0.0f ? weight[x] : 0.0f;
     std::memcpy(depth, in_.depth + static_cast<size_t>(y) * width, width * sizeof(float));
-    for (int x = 0; x < width; ++x) {
-      const bool counts = weight[x] > 0.0f;
-      red[x] = counts ? pixels[3 * x] : 0.0f;
-      green[x] = counts ? pixels[3 * x + 1] : 0.0f;
-      blue[x] = counts ? pixels[3 * x + 2] : 0.0f;
-    }
     Lanes sum_w = Lanes{}, sum_depth = Lanes{};
     for (int x = 0; x < width; x += kLanes) {
       const Lanes weights = load(w + x), d = load(depth + x), zero = Lanes{};
       const Mask known = (d > 0.0f) & (d < kFar) & (weights > 0.0f);
       store(depth + x, known ? d : zero);
+      Lanes color[3];
+      load_rows<3>(pixels, x, width, color);
+      for (int c = 0; c < 3; ++c)
+        store(plane(kTarget + c, y) + x, weights > 0.0f ? color[c] : zero);
       sum_w += weights;
       sum_depth += known ? weights : zero;
     }
@@ -206,9 +203,13 @@ class Loss {
     const size_t length = layout_.stride;
     for (int k = 0; k < kCount; ++k, in += length, out += length)
       for (int x = 0; x < layout_.width; x += kLanes) {
-        const float* at = in + Layout::kBorder + x;
-        Lanes sum = window_[0] * load(at);
-        for (int d = 1; d <= kRadius; ++d) sum += window_[d] * (load(at - d) + load(at + d));
+        const Neighbours at(in + Layout::kBorder + x);
+        Lanes sum = window_[0] * at.shifted<0>();
+        sum += window_[1] * (at.shifted<-1>() + at.shifted<1>());
+        sum += window_[2] * (at.shifted<-2>() + at.shifted<2>());
+        sum += window_[3] * (at.shifted<-3>() + at.shifted<3>());
+        sum += window_[4] * (at.shifted<-4>() + at.shifted<4>());
+        sum += window_[5] * (at.shifted<-5>() + at.shifted<5>());
         store(out + x, sum);
       }
   }

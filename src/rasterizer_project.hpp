@@ -16,8 +16,6 @@
 
 #pragma once
 
-#include <algorithm>
-
 #include "rasterizer_simd.hpp"
 
 namespace bdgs {
@@ -48,28 +46,6 @@ struct Parameters {
   const uint8_t* active;  // null: all
   int count;
 };
-
-// Read rows i .. i + kLanes - 1 of an array [count, kColumns] into one vector per column. The
-// tail repeats the last row; callers mask it.
-template <int kColumns>
-inline void load_rows(const float* array, int i, int count, Lanes* out) {
-  const float* row = array + static_cast<size_t>(i) * kColumns;
-  if (i + kLanes <= count) return split_columns<kColumns>(row, out);
-  alignas(64) float rows[kLanes * kColumns];
-  for (int lane = 0; lane < kLanes; ++lane)
-    std::memcpy(rows + lane * kColumns, row + std::min(lane, count - 1 - i) * kColumns,
-                kColumns * sizeof(float));
-  split_columns<kColumns>(rows, out);
-}
-
-template <int kColumns>
-inline void store_rows(float* array, int i, int count, const Lanes* in) {
-  float* row = array + static_cast<size_t>(i) * kColumns;
-  if (i + kLanes <= count) return join_columns<kColumns>(in, row);
-  alignas(64) float rows[kLanes * kColumns];
-  join_columns<kColumns>(in, rows);
-  std::memcpy(row, rows, (count - i) * kColumns * sizeof(float));
-}
 
 struct Ellipses {
   Lanes mean[3], quat[4], inverse_norm;  // quat is normalised

@@ -5,6 +5,7 @@
 
 #pragma once
 
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <cstdlib>
@@ -119,6 +120,58 @@ inline float largest(Lanes v) {
   return best;
 }
 
+// Lanes l of `even` and `odd` become the two halves of to[pair_place(l)].
+inline void interleave(Lanes even, Lanes odd, double* to) {
+#if defined(__AVX512F__)
+  const __m512 a = reinterpret_cast<__m512>(even), b = reinterpret_cast<__m512>(odd);
+  _mm512_store_ps(reinterpret_cast<float*>(to), _mm512_unpacklo_ps(a, b));
+  _mm512_store_ps(reinterpret_cast<float*>(to + 8), _mm512_unpackhi_ps(a, b));
+#elif defined(__AVX2__)
+  const __m256 a = reinterpret_cast<__m256>(even), b = reinterpret_cast<__m256>(odd);
+  _mm256_store_ps(reinterpret_cast<float*>(to), _mm256_unpacklo_ps(a, b));
+  _mm256_store_ps(reinterpret_cast<float*>(to + 4), _mm256_unpackhi_ps(a, b));
+#else
+  alignas(64) float pairs[2 * kLanes];
+  for (int l = 0; l < kLanes; ++l) pairs[2 * l] = even[l], pairs[2 * l + 1] = odd[l];
+  std::memcpy(to, pairs, sizeof(pairs));
+#endif
+}
+
+constexpr int pair_place(int l) {
+#if defined(__AVX2__)
+  return l / 4 * 2 + l % 2 + (l % 4 / 2) * (kLanes / 2);
+#else
+  return l;
+#endif
+}
+
+inline Lanes splat_pair(double pair) {
+  typedef double Doubles __attribute__((vector_size(sizeof(Lanes))));
+  return reinterpret_cast<Lanes>(pair - Doubles{});
+}
+
+// A vector in memory and those around it: shifted<d>() is load(at + d) for |d| < kLanes.
+struct Neighbours {
+#if defined(__AVX512F__)
+  __m512i before, here, after;  // three aligned loads and shuffles beat many loads off the line
+  explicit Neighbours(const float* at)
+      : before(_mm512_loadu_si512(at - 16)), here(_mm512_loadu_si512(at)),
+        after(_mm512_loadu_si512(at + 16)) {}
+  template <int kBy>
+  Lanes shifted() const {
+    return reinterpret_cast<Lanes>(kBy < 0 ? _mm512_alignr_epi32(here, before, (16 + kBy) & 15)
+                                           : _mm512_alignr_epi32(after, here, kBy & 15));
+  }
+#else
+  const float* at;
+  explicit Neighbours(const float* where) : at(where) {}
+  template <int kBy>
+  Lanes shifted() const {
+    return load(at + kBy);
+  }
+#endif
+};
+
 // Row l of `to` becomes lane l of all kLanes vectors.
 inline void transpose(const Lanes* from, float* to, size_t stride) {
 #if defined(__AVX512F__)
@@ -204,6 +257,28 @@ inline void join_columns(const Lanes* in, float* rows) {
   for (int lane = 0; lane < kLanes; ++lane)
     for (int k = 0; k < kColumns; ++k) rows[lane * kColumns + k] = columns[k][lane];
 #endif
+}
+
+// Read rows i .. i + kLanes - 1 of an array [count, kColumns] into one vector per column. The
+// tail repeats the last row; callers mask it.
+template <int kColumns>
+inline void load_rows(const float* array, int i, int count, Lanes* out) {
+  const float* row = array + static_cast<size_t>(i) * kColumns;
+  if (i + kLanes <= count) return split_columns<kColumns>(row, out);
+  alignas(64) float rows[kLanes * kColumns];
+  for (int lane = 0; lane < kLanes; ++lane)
+    std::memcpy(rows + lane * kColumns, row + std::min(lane, count - 1 - i) * kColumns,
+                kColumns * sizeof(float));
+  split_columns<kColumns>(rows, out);
+}
+
+template <int kColumns>
+inline void store_rows(float* array, int i, int count, const Lanes* in) {
+  float* row = array + static_cast<size_t>(i) * kColumns;
+  if (i + kLanes <= count) return join_columns<kColumns>(in, row);
+  alignas(64) float rows[kLanes * kColumns];
+  join_columns<kColumns>(in, rows);
+  std::memcpy(row, rows, (count - i) * kColumns * sizeof(float));
 }
 
 // An array that keeps its memory between calls and starts on a cache line.
