@@ -36,7 +36,8 @@ class GaussianMap:
 
     `parameters` holds the optimised arrays by their names in `PARAMETERS`; `moments` the first
     and second Adam moments of the same shapes; `keyframe_index` the keyframe that brought each
-    Gaussian, [N] int32; `observations` how often it was seen, [N] int32.
+    Gaussian, [N] int32; `observations` how often it was seen, [N] int32. `contribution`, `checks`
+    and `confirmations` are what pruning remembers (`bdgs_ros.mapping.prune`), not saved.
     """
 
     def __init__(self, config: BeliefConfig) -> None:
@@ -52,6 +53,9 @@ class GaussianMap:
         self.belief = BeliefTracker(config)
         self.keyframe_index = np.zeros(0, np.int32)
         self.observations = np.zeros(0, np.int32)
+        self.contribution = np.zeros(0, np.float32)
+        self.checks = np.zeros(0, np.int32)
+        self.confirmations = np.zeros(0, np.int32)
 
     def __len__(self) -> int:
         """Return the number of Gaussians."""
@@ -117,7 +121,11 @@ class GaussianMap:
             self.moments[name] = [_join(m, np.zeros_like(block)) for m in old]
         self.belief.append(new.belief)
         self.keyframe_index = _join(self.keyframe_index, np.full(count, keyframe_index, np.int32))
-        self.observations = _join(self.observations, np.zeros(count, np.int32))
+        none = np.zeros(count, np.int32)
+        self.observations = _join(self.observations, none)
+        self.contribution = _join(self.contribution, np.ones(count, np.float32))
+        self.checks = _join(self.checks, none)
+        self.confirmations = _join(self.confirmations, none)
 
     def keep(self, mask: NDArray[np.bool_]) -> None:
         """Drop the Gaussians where `mask`, shape (N,), is False."""
@@ -129,6 +137,9 @@ class GaussianMap:
         self.belief.keep(mask)
         self.keyframe_index = self.keyframe_index[mask]
         self.observations = self.observations[mask]
+        self.contribution = self.contribution[mask]
+        self.checks = self.checks[mask]
+        self.confirmations = self.confirmations[mask]
 
     def megabytes(self) -> float:
         """Return the size of the parameters and beliefs in memory, without optimiser state."""

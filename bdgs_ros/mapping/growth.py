@@ -1,4 +1,4 @@
-"""Where Gaussians are added, and which are taken out."""
+"""Where Gaussians are added."""
 
 from __future__ import annotations
 
@@ -6,10 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bdgs_ros.core.config import BeliefConfig
-from bdgs_ros.core.config.mapping import InsertConfig, PruneConfig
+from bdgs_ros.core.config.mapping import InsertConfig
 from bdgs_ros.core.types import DepthImage
-from bdgs_ros.mapping.gaussians import GaussianMap
 from bdgs_ros.mapping.rasterize import Rendered
 
 Array = NDArray[np.float32]
@@ -76,25 +74,3 @@ def surface_depth(rendered: Rendered) -> DepthImage:
     """Return rendered depth over silhouette, metres; 0 where the map is empty."""
     safe = np.maximum(rendered.silhouette, 1e-6)
     return np.where(rendered.silhouette > 1e-3, rendered.depth / safe, 0).astype(np.float32)
-
-
-def worth_keeping(gaussians: GaussianMap, config: PruneConfig) -> Mask:
-    """Return which Gaussians are neither too faint, too large nor over the budget, [N]."""
-    faint = gaussians.logit_opacities < np.log(config.opacity / (1 - config.opacity))
-    large = gaussians.log_scales.max(axis=1, initial=-np.inf) > np.log(config.scale)
-    keep = ~(faint | large)
-    excess = int(keep.sum()) - config.max_gaussians
-    if excess > 0:
-        rank = np.where(keep, gaussians.logit_opacities, np.inf)
-        keep[np.argpartition(rank, excess)[:excess]] = False
-    return np.asarray(keep)
-
-
-def confirmed_gone(gaussians: GaussianMap, seen_through: Mask, config: BeliefConfig) -> Mask:
-    """
-    Return the Gaussians that may be deleted: believed dynamic, and free space where they were.
-
-    Deletion is delayed on purpose: a Gaussian that is only believed to be dynamic stays frozen
-    and unrendered, so that it can come back.
-    """
-    return np.asarray((gaussians.belief.smoothed > config.delete_above) & seen_through)

@@ -23,7 +23,7 @@ from bdgs_ros.core.types import (
     StampedPose,
     Trajectory,
 )
-from bdgs_ros.mapping import growth
+from bdgs_ros.mapping import growth, prune
 from bdgs_ros.mapping.exposure import fit_exposure
 from bdgs_ros.mapping.gaussians import GaussianMap
 from bdgs_ros.mapping.history import History
@@ -91,15 +91,15 @@ class Mapper:
         if self.frozen:
             return self.view(fine.frame.stamp_ns, fine.T_world_camera, fine.frame.camera)
         small = shrink(fine, self._config.growth_width)
-        self._infer(small)
-        static = self.render(small.T_world_camera, small.frame.camera)
+        agree = self._infer(small)
+        static = self._look(small, agree)
         in_front = self._in_front(small, static)
         level = self._growth_level(small, in_front)
         current = self._remember(fine, level.static)
         self._calibrate(current, level, static)
         self._insert(current, level, static, in_front & ~is_dynamic(small.p_dynamic))
         self._optimiser.run(self.map, current, self._companions())
-        self.map.keep(growth.worth_keeping(self.map, self._config.prune))
+        self._thin()
         self.history.publish(current)
         return self.view(
             current.stamp_ns, current.T_world_camera, fine.frame.camera, current.exposure
@@ -114,19 +114,28 @@ class Mapper:
         return self._render(T_world_camera, camera, None)
 
     def _render(
-        self, T_world_camera: Pose, camera: PinholeCamera, active: Mask | None
+        self,
+        T_world_camera: Pose,
+        camera: PinholeCamera,
+        active: Mask | None,
+        statistics: bool = False,
     ) -> Rendered:
         return render(
             self.map.as_gaussians(),
             se3.inverse(T_world_camera),
             camera,
             active=active,
+            statistics=statistics,
             threads=self._config.threads,
             backend=self._config.backend,
         )
 
-    def _infer(self, keyframe: Keyframe) -> None:
-        """Update every belief with what this keyframe says, Eq. 1-6, 10; delete what is gone."""
+    def _infer(self, keyframe: Keyframe) -> Mask:
+        """
+        Update every belief with what this keyframe says, Eq. 1-6, 10; delete what is gone.
+
+        Returns where the camera measured the depth of a Gaussian that is still there, [N].
+        """
         observation = likelihood.Observation(
             se3.inverse(keyframe.T_world_camera),
             keyframe.frame.camera,
@@ -143,8 +152,26 @@ class Mapper:
             self.map.belief.observe(stamp_ns, keyframe.T_world_camera, evidence)
         else:
             self.map.belief.overwrite(likelihood.label(features), features.visible)
-        seen_through = features.values[:, likelihood.FEATURES.index('free_space')] > 0
-        self.map.keep(~growth.confirmed_gone(self.map, seen_through, self._belief))
+        prune.note_checks(self.map, features)
+        seen_through, agree = (
+            features.values[:, likelihood.FEATURES.index(name)] > 0
+            for name in ('free_space', 'agreement')
+        )
+        gone = prune.confirmed_gone(self.map, seen_through, self._belief)
+        gone |= prune.unconfirmed(self.map, self._count, self._config.prune)
+        self.map.keep(~gone)
+        return np.asarray(agree[~gone])
+
+    def _look(self, keyframe: Keyframe, agree: Mask) -> Rendered:
+        """Render the static map as a keyframe finds it; what adds nothing to such views goes."""
+        T, camera = keyframe.T_world_camera, keyframe.frame.camera
+        static = self._render(T, camera, self.map.visible_mask(), statistics=True)
+        assert static.max_weight is not None
+        resolved = prune.resolved_by(self.map, se3.inverse(T), camera)
+        config = self._config.prune
+        prune.note_contribution(self.map, agree, static.max_weight, resolved, config)
+        self.map.keep(~prune.redundant(self.map, config))
+        return static
 
     def _in_map_colors(self, frame: RgbdFrame) -> NDArray[np.float32]:
         """Return an image without falloff and, as far as is known yet, exposure, [H, W, 3]."""
@@ -222,6 +249,12 @@ class Mapper:
         # hidden by Eq. 11, and the filter decides whether it stays.
         new = without_specks(unnamed & unknown, _MIN_BLOB_SHARE)
         grow(usable & new, self._belief.initial_in_front)
+
+    def _thin(self) -> None:
+        """Take out what is of no use, and the least useful beyond the budget."""
+        config = self._config.prune
+        self.map.keep(prune.worth_keeping(self.map, config))
+        self.map.keep(~prune.faintest(self.map, len(self.map) - config.max_gaussians))
 
     def _companions(self) -> list[MapKeyframe]:
         """Return the window and as many older keyframes at random, in random order."""

@@ -1,14 +1,13 @@
-"""Where Gaussians may come from and when they go."""
+"""Where Gaussians may come from, and which keyframes stay."""
 
 import numpy as np
 import pytest
 
 from bdgs_ros.core import se3
 from bdgs_ros.core.camera import PinholeCamera
-from bdgs_ros.core.config import BeliefConfig, MappingConfig
+from bdgs_ros.core.config import MappingConfig
 from bdgs_ros.core.types import Keyframe, RgbdFrame
 from bdgs_ros.mapping import growth
-from bdgs_ros.mapping.gaussians import GaussianMap, NewGaussians
 from bdgs_ros.mapping.keyframes import MapKeyframe, build_levels, most_redundant, shrink
 
 CAMERA = PinholeCamera(64, 48, 60.0, 60.0, 31.5, 23.5)
@@ -46,42 +45,6 @@ def test_nothing_comes_from_edges_or_bad_depth() -> None:
     assert not candidates[:, 31:33].any()
     assert not candidates[5:10].any()
     assert not candidates[40:].any()
-
-
-def small_map(opacities: list[float], scales: list[float]) -> GaussianMap:
-    gaussians = GaussianMap(BeliefConfig())
-    count = len(opacities)
-    for opacity, scale in zip(opacities, scales, strict=True):
-        new = NewGaussians(
-            np.zeros((1, 3), np.float32),
-            np.array([scale], np.float32),
-            np.zeros((1, 3), np.float32),
-            np.array([0.3], np.float32),
-        )
-        gaussians.append(new, opacity, 0)
-    assert len(gaussians) == count
-    return gaussians
-
-
-def test_faint_and_large_gaussians_go() -> None:
-    config = MappingConfig().prune
-    gaussians = small_map([0.9, config.opacity / 2, 0.9], [0.01, 0.01, 2 * config.scale])
-    assert growth.worth_keeping(gaussians, config).tolist() == [True, False, False]
-
-
-def test_the_budget_takes_the_faintest() -> None:
-    config = type(MappingConfig().prune)(max_gaussians=100)
-    gaussians = small_map([0.3 + 0.004 * i for i in range(120)], [0.01] * 120)
-    keep = growth.worth_keeping(gaussians, config)
-    assert keep.sum() == 100
-    assert keep[20:].all()
-
-
-def test_only_what_is_seen_through_is_deleted() -> None:
-    gaussians = small_map([0.9] * 3, [0.01] * 3)
-    gaussians.belief.smoothed[:] = [0.99, 0.99, 0.2]
-    gone = growth.confirmed_gone(gaussians, np.array([True, False, True]), BeliefConfig())
-    assert gone.tolist() == [True, False, False]
 
 
 @pytest.mark.parametrize('width', [64, 32])

@@ -51,7 +51,7 @@ class InsertConfig:
     )
     doublings: int = param(3, 'times that it doubles where there is none', low=0, high=6)
     detail: float = param(
-        0.04, 'cells that lose more of the image (RMS of colour in [0, 1]) are split', low=0.0
+        0.025, 'cells that lose more of the image (RMS of colour in [0, 1]) are split', low=0.0
     )
     sigma_px: float = param(
         0.85, 'standard deviation of a new Gaussian over its cell', low=0.1, high=5.0
@@ -82,6 +82,20 @@ class PruneConfig:
 
     opacity: float = param(0.05, 'fainter Gaussians go', low=0.0, high=1.0)
     scale: float = param(0.4, 'larger Gaussians go', unit='m', low=0.001)
+    axis_ratio: float = param(
+        36.0, 'Gaussians longer than so many times their second axis go', low=1.0
+    )
+    contribution: float = param(
+        0.03, 'Gaussians whose weight in views of their surface is less go', low=0.0, high=1.0
+    )
+    fading: float = param(
+        0.3, 'share of a larger weight seen before that still counts', low=0.0, high=1.0
+    )
+    trial: int = param(5, 'keyframes for which a Gaussian is new', low=0)
+    trial_checks: int = param(2, 'keyframes that must have looked at a new Gaussian', low=1)
+    trial_share: float = param(
+        0.5, 'share of them that must have seen it, or it goes', low=0.0, high=1.0
+    )
     max_gaussians: int = param(80000, 'budget', low=100)
 
 
