@@ -882,7 +882,7 @@ PYBIND11_MODULE(BDGS_MODULE, m) {
   using namespace bdgs;
   m.doc() = "Gaussian rasteriser; use bdgs_ros.mapping.rasterize, which checks its arguments";
   m.def("supports", &supports);
-  m.def("adam_step", &adam_step);
+  m.def("adam_steps", &adam_steps);
   py::class_<Rasterizer>(m, "Rasterizer", py::module_local())
       .def(py::init<>())
       .def("render", &render)

@@ -1,10 +1,14 @@
-// One step of Adam (Kingma and Ba, 2015, algorithm 1), in place; step 0 leaves out the correction of
-// the moments' bias.
+// One step of Adam (Kingma and Ba, 2015, algorithm 1), in place, on several arrays that share their
+// rows; step 0 leaves out the correction of the moments' bias.
+//
+// kLanes rows at a time: most often all of them are wanted or none. Else whole vectors are computed
+// and the rows that are not wanted keep what they had.
 
 #pragma once
 
 #include <array>
 #include <cmath>
+#include <stdexcept>
 #include <vector>
 
 #include <pybind11/numpy.h>
@@ -13,75 +17,101 @@
 
 namespace bdgs {
 
-struct AdamStep {
-  float rate, beta1, beta2, rest1, rest2, eps, correction2;  // bias correction folded into rate
+struct AdamConstants {
+  float beta1, beta2, rest1, rest2, eps, correction2;
 };
 
-inline void adam_lanes(const AdamStep& s, float* p, const float* g, float* m, float* v) {
-  const Lanes grad = load(g);
-  const Lanes first = s.beta1 * load(m) + s.rest1 * grad;
-  const Lanes second = s.beta2 * load(v) + s.rest2 * grad * grad;
-  store(m, first);
-  store(v, second);
-  store(p, load(p) - s.rate * first / (sqrt(second * s.correction2) + s.eps));
+struct AdamArrays {
+  float* params;
+  const float* grads;
+  float *first, *second;
+  ptrdiff_t columns;
+  float rate;  // with the correction of the first moment's bias
+};
+
+inline void adam_lanes(const AdamConstants& c, float rate, Mask wanted, const float* grads,
+                       float* params, float* first, float* second) {
+  const Lanes g = load(grads), old_m = load(first), old_v = load(second), p = load(params);
+  const Lanes m = c.beta1 * old_m + c.rest1 * g;
+  const Lanes v = c.beta2 * old_v + c.rest2 * g * g;
+  const Lanes moved = p - rate * m / (sqrt(v * c.correction2) + c.eps);
+  store(first, wanted ? m : old_m);
+  store(second, wanted ? v : old_v);
+  store(params, wanted ? moved : p);
 }
 
-inline void adam_one(const AdamStep& s, float& p, float g, float& m, float& v) {
-  m = s.beta1 * m + s.rest1 * g;
-  v = s.beta2 * v + s.rest2 * g * g;
-  p -= s.rate * m / (std::sqrt(v * s.correction2) + s.eps);
+inline void adam_one(const AdamConstants& c, const AdamArrays& a, ptrdiff_t i) {
+  const float g = a.grads[i];
+  a.first[i] = c.beta1 * a.first[i] + c.rest1 * g;
+  a.second[i] = c.beta2 * a.second[i] + c.rest2 * g * g;
+  a.params[i] -= a.rate * a.first[i] / (std::sqrt(a.second[i] * c.correction2) + c.eps);
 }
 
-// Whole vectors where all rows they hold are wanted, single elements elsewhere.
-inline void adam_range(const AdamStep& s, float* p, const float* g, float* m, float* v,
-                       const uint8_t* rows, ptrdiff_t columns, ptrdiff_t from, ptrdiff_t to) {
-  ptrdiff_t i = from;
-  for (; i + kLanes <= to; i += kLanes) {
-    int wanted = kLanes;
-    if (rows != nullptr) {
-      wanted = 0;
-      ptrdiff_t row = i / columns, column = i % columns;
-      for (int l = 0; l < kLanes; ++l) {
-        wanted += rows[row];
-        if (++column == columns) column = 0, ++row;
-      }
+// kLanes rows from `row` on; `wanted` has one lane per row.
+template <int kColumns>
+inline void adam_rows(const AdamConstants& c, const AdamArrays& a, ptrdiff_t row, Lanes wanted) {
+  Lanes rows[kColumns];
+  for (int k = 0; k < kColumns; ++k) rows[k] = wanted;
+  alignas(64) float elements[kColumns * kLanes];
+  join_columns<kColumns>(rows, elements);
+  const ptrdiff_t at = row * kColumns;
+  for (int k = 0; k < kColumns * kLanes; k += kLanes)
+    adam_lanes(c, a.rate, load(elements + k) > 0.0f, a.grads + at + k, a.params + at + k,
+               a.first + at + k, a.second + at + k);
+}
+
+inline void adam_stretch(const AdamConstants& c, const AdamArrays& a, const uint8_t* rows,
+                         ptrdiff_t from, ptrdiff_t to) {
+  ptrdiff_t row = from;
+  for (; row + kLanes <= to && (a.columns == 1 || a.columns == 3 || a.columns == 4);
+       row += kLanes) {
+    alignas(64) float wanted[kLanes];
+    int count = 0;
+    for (int lane = 0; lane < kLanes; ++lane) {
+      const bool is_wanted = rows == nullptr || rows[row + lane] != 0;
+      wanted[lane] = is_wanted ? 1.0f : 0.0f;
+      count += is_wanted;
     }
-    if (wanted == kLanes) {
-      adam_lanes(s, p + i, g + i, m + i, v + i);
-    } else if (wanted > 0) {
-      for (ptrdiff_t k = i; k < i + kLanes; ++k)
-        if (rows[k / columns]) adam_one(s, p[k], g[k], m[k], v[k]);
-    }
+    if (count == 0) continue;
+    if (a.columns == 1) adam_rows<1>(c, a, row, load(wanted));
+    if (a.columns == 3) adam_rows<3>(c, a, row, load(wanted));
+    if (a.columns == 4) adam_rows<4>(c, a, row, load(wanted));
   }
-  for (; i < to; ++i)
-    if (rows == nullptr || rows[i / columns]) adam_one(s, p[i], g[i], m[i], v[i]);
+  for (; row < to; ++row)
+    if (rows == nullptr || rows[row])
+      for (ptrdiff_t k = 0; k < a.columns; ++k) adam_one(c, a, row * a.columns + k);
 }
 
-inline void adam_step(pybind11::array_t<float, 16> params, pybind11::array_t<float, 16> grads,
-                      pybind11::array_t<float, 16> first, pybind11::array_t<float, 16> second,
-                      int step, double rate, std::array<double, 2> betas, double eps,
-                      pybind11::object mask, int threads) {
-  AdamStep s{};
-  const bool corrected = step > 0;
-  s.rate = static_cast<float>(corrected ? rate / (1.0 - std::pow(betas[0], step)) : rate);
-  s.beta1 = static_cast<float>(betas[0]);
-  s.beta2 = static_cast<float>(betas[1]);
-  s.rest1 = static_cast<float>(1.0 - betas[0]);
-  s.rest2 = static_cast<float>(1.0 - betas[1]);
-  s.eps = static_cast<float>(eps);
-  s.correction2 = corrected ? static_cast<float>(1.0 / (1.0 - std::pow(betas[1], step))) : 1.0f;
-  const ptrdiff_t size = params.size();
-  const ptrdiff_t columns = params.ndim() > 1 ? params.shape(1) : 1;
-  float *p = params.mutable_data(), *m = first.mutable_data(), *v = second.mutable_data();
-  const float* g = grads.data();
-  pybind11::array_t<uint8_t, 16> wanted;
-  if (!mask.is_none()) wanted = mask.cast<pybind11::array_t<uint8_t, 16>>();
-  const uint8_t* rows = mask.is_none() ? nullptr : wanted.data();
+// `groups`: tuples (params, grads, first, second, rate) with the same number of rows.
+inline void adam_steps(const std::vector<pybind11::tuple>& groups, int step,
+                       std::array<double, 2> betas, double eps, const pybind11::object& mask,
+                       int threads) {
+  using Floats = pybind11::array_t<float, pybind11::array::c_style>;
+  const double correction1 = step > 0 ? 1.0 - std::pow(betas[0], step) : 1.0;
+  const double correction2 = step > 0 ? 1.0 - std::pow(betas[1], step) : 1.0;
+  const AdamConstants c{static_cast<float>(betas[0]),       static_cast<float>(betas[1]),
+                        static_cast<float>(1.0 - betas[0]), static_cast<float>(1.0 - betas[1]),
+                        static_cast<float>(eps),            static_cast<float>(1.0 / correction2)};
+  std::vector<AdamArrays> arrays;
+  ptrdiff_t count = 0;
+  for (const pybind11::tuple& group : groups) {
+    Floats params = group[0].cast<Floats>();
+    count = params.ndim() > 0 ? params.shape(0) : 1;
+    arrays.push_back({params.mutable_data(), group[1].cast<Floats>().data(),
+                      group[2].cast<Floats>().mutable_data(),
+                      group[3].cast<Floats>().mutable_data(), count > 0 ? params.size() / count : 0,
+                      static_cast<float>(group[4].cast<double>() / correction1)});
+  }
+  const uint8_t* rows =
+      mask.is_none()
+          ? nullptr
+          : mask.cast<pybind11::array_t<uint8_t, pybind11::array::c_style>>().data();
   pybind11::gil_scoped_release release;
-  const ptrdiff_t chunk = 1 << 14;  // elements; a multiple of kLanes
+  const ptrdiff_t stretch = 64 * kLanes;
 #pragma omp parallel for schedule(static) num_threads(threads)
-  for (ptrdiff_t from = 0; from < size; from += chunk)
-    adam_range(s, p, g, m, v, rows, columns, from, from + chunk < size ? from + chunk : size);
+  for (ptrdiff_t from = 0; from < count; from += stretch)
+    for (const AdamArrays& a : arrays)
+      adam_stretch(c, a, rows, from, from + stretch < count ? from + stretch : count);
 }
 
 }  // namespace bdgs

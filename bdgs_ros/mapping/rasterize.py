@@ -8,6 +8,7 @@ The native backend is `src/rasterizer.cpp`, which explains the algorithm; its re
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from functools import lru_cache
 from importlib.util import find_spec
 
@@ -18,6 +19,8 @@ from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.errors import MapError
 from bdgs_ros.mapping.rasterize_native import VARIANTS, NativeBackend, load_module
 from bdgs_ros.mapping.rasterize_types import (
+    AdamConstants,
+    AdamGroup,
     Array,
     Backend,
     FusedResult,
@@ -33,12 +36,14 @@ from bdgs_ros.mapping.rasterize_types import (
 )
 
 __all__ = [
+    'AdamGroup',
     'FusedResult',
     'Gaussians',
     'Gradients',
     'LossWeights',
     'Rendered',
     'adam_step',
+    'adam_steps',
     'available_backends',
     'backward',
     'fused_step',
@@ -311,30 +316,72 @@ def adam_step(
         If shapes differ, an array to change is not float32 in C order, or step < 1.
 
     """
-    for name, array in (('params', params), ('first', first), ('second', second)):
-        expect_shape(name, array, params.shape)
-        if array.dtype != np.float32 or not array.flags.c_contiguous:
-            raise ValueError(f'{name}: expected float32 in C order, received {array.dtype}')
+    group = AdamGroup(params, grads, first, second, rate)
+    adam_steps(
+        [group], step=step, rows=rows, betas=betas, eps=eps, threads=threads, backend=backend
+    )
+
+
+def adam_steps(
+    groups: Sequence[AdamGroup],
+    *,
+    step: int | None = None,
+    rows: NDArray[np.bool_] | None = None,
+    betas: tuple[float, float] = (0.9, 0.999),
+    eps: float = 1e-15,
+    threads: int = 1,
+    backend: str = 'auto',
+) -> None:
+    """
+    Make one step of Adam in place on several arrays that share their rows, in one call.
+
+    Parameters
+    ----------
+    groups : sequence of AdamGroup
+        Arrays of the same length N, each with its gradient, moments and rate.
+    step, rows, betas, eps, threads, backend
+        As for `adam_step`.
+
+    Raises
+    ------
+    ValueError
+        If shapes differ, an array to change is not float32 in C order, or step < 1.
+
+    """
     if step is not None and step < 1:
         raise ValueError(f'step: expected 1 or more, received {step}')
-    if rows is not None:
-        expect_shape('rows', rows, params.shape[:1])
+    checked = [_checked(group) for group in groups]
+    for group in checked:
+        expect_shape(
+            'params', group.params, (*groups[0].params.shape[:1], *group.params.shape[1:])
+        )
+    if rows is not None and groups:
+        expect_shape('rows', rows, groups[0].params.shape[:1])
         rows = np.ascontiguousarray(rows, dtype=np.bool_)
-    arrays = (params, as_float32('grads', grads, params.shape), first, second)
+    constants = AdamConstants(step or 0, betas, eps)
     chosen = _backend(backend)
     if isinstance(chosen, NativeBackend):
-        chosen.adam_step(arrays, rows, (step or 0, rate, betas, eps), threads)
+        chosen.adam_steps(checked, rows, constants, threads)
     else:
-        _adam_numpy(arrays, rows, (step or 0, rate, betas, eps))
+        for group in checked:
+            _adam_numpy(group, rows, constants)
+
+
+def _checked(group: AdamGroup) -> AdamGroup:
+    shape = group.params.shape
+    for name in ('params', 'first', 'second'):
+        array = getattr(group, name)
+        expect_shape(name, array, shape)
+        if array.dtype != np.float32 or not array.flags.c_contiguous:
+            raise ValueError(f'{name}: expected float32 in C order, received {array.dtype}')
+    return group._replace(grads=as_float32('grads', group.grads, shape))
 
 
 def _adam_numpy(
-    arrays: tuple[Array, Array, Array, Array],
-    rows: NDArray[np.bool_] | None,
-    constants: tuple[int, float, tuple[float, float], float],
+    group: AdamGroup, rows: NDArray[np.bool_] | None, constants: AdamConstants
 ) -> None:
-    params, grads, first, second = arrays
-    step, rate, (beta1, beta2), eps = constants
+    params, grads, first, second, rate = group
+    step, (beta1, beta2), eps = constants
     at = slice(None) if rows is None else rows
     m = beta1 * first[at] + (1 - beta1) * grads[at]
     v = beta2 * second[at] + (1 - beta2) * grads[at] ** 2

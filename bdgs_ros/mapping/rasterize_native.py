@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import threading
+from collections.abc import Sequence
 from types import ModuleType
 from typing import Any
 
@@ -11,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bdgs_ros.mapping.rasterize_types import (
+    AdamConstants,
+    AdamGroup,
     Array,
     FusedResult,
     Gradients,
@@ -100,16 +103,16 @@ class NativeBackend:
             empty,
         )
 
-    def adam_step(
+    def adam_steps(
         self,
-        arrays: tuple[Array, Array, Array, Array],
+        groups: Sequence[AdamGroup],
         rows: NDArray[np.bool_] | None,
-        constants: tuple[int, float, tuple[float, float], float],
+        constants: AdamConstants,
         threads: int,
     ) -> None:
-        """Update (params, grads, first, second) in place; constants are step, rate, betas, eps."""
+        """Make one step of Adam in place; groups have the same number of rows."""
         mask = None if rows is None else rows.view(np.uint8)
-        self._module.adam_step(*arrays, *constants, mask, threads)
+        self._module.adam_steps([tuple(g) for g in groups], *constants, mask, threads)
 
 
 def _arguments(scene: Scene) -> tuple[Any, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -144,6 +144,28 @@ class Scene:
     T_camera_world: Pose
     camera: PinholeCamera
     threads: int
+
+
+class AdamGroup(NamedTuple):
+    """An array that Adam changes, with all it needs; arrays have the shape of `params`."""
+
+    params: Array
+    """[N, ...]; changed, like its moments."""
+    grads: Array
+    """Gradient by `params`."""
+    first: Array
+    second: Array
+    rate: float
+    """Step size."""
+
+
+class AdamConstants(NamedTuple):
+    """What all arrays of a step share."""
+
+    step: int
+    """Number of this step from 1; 0 leaves the correction of the moments' bias out."""
+    betas: tuple[float, float]
+    eps: float
 
 
 class Backend(Protocol):

@@ -20,12 +20,14 @@ from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.errors import MapError
 from bdgs_ros.mapping import rasterize, rasterize_native, rasterize_torch
 from bdgs_ros.mapping.rasterize import (
+    AdamGroup,
     FusedResult,
     Gaussians,
     Gradients,
     LossWeights,
     Rendered,
     adam_step,
+    adam_steps,
     available_backends,
     backward,
     fused_step,
@@ -496,6 +498,25 @@ def test_sparse_adam_touches_only_its_rows(name: str, shape: tuple[int, ...]) ->
     np.testing.assert_allclose(params[rows], wanted[rows], rtol=1e-4, atol=1e-6)
     np.testing.assert_array_equal(params[~rows], start[~rows])
     assert not first[~rows].any() and not second[~rows].any()
+
+
+@pytest.mark.parametrize('name', available_backends())
+def test_adam_on_several_arrays_is_adam_on_each(name: str) -> None:
+    """Rows wanted all, some and none of a vector, a number of columns without a fast path."""
+    rng = np.random.default_rng(0)
+    count = 203
+    shapes = ((count, 3), (count, 4), (count,), (count, 2))
+    rows = rng.uniform(size=count) > 0.5
+    rows[32:64], rows[64:96] = True, False
+    arrays = [[rng.uniform(0.1, 1, s).astype(np.float32) for _ in range(4)] for s in shapes]
+    together = [AdamGroup(*(a.copy() for a in g), rate=0.1 * k) for k, g in enumerate(arrays)]
+    adam_steps(together, rows=rows, step=3, threads=2, backend=name)
+    for k, (group, alone) in enumerate(zip(together, arrays, strict=True)):
+        adam_step(*alone, rate=0.1 * k, rows=rows, step=3, backend='torch')
+        for ours, twin in zip(group[:4], alone, strict=True):
+            np.testing.assert_allclose(ours, twin, rtol=1e-6)
+    with pytest.raises(ValueError, match='params'):
+        adam_steps([together[0], AdamGroup(*(a[1:] for a in together[1][:4]), 0.1)], backend=name)
 
 
 def test_adam_refuses_what_it_cannot_change_in_place() -> None:
