@@ -60,26 +60,23 @@ inline void adam_rows(const AdamConstants& c, const AdamArrays& a, ptrdiff_t row
                a.first + at + k, a.second + at + k);
 }
 
-inline void adam_stretch(const AdamConstants& c, const AdamArrays& a, const uint8_t* rows,
-                         ptrdiff_t from, ptrdiff_t to) {
-  ptrdiff_t row = from;
-  for (; row + kLanes <= to && (a.columns == 1 || a.columns == 3 || a.columns == 4);
-       row += kLanes) {
-    alignas(64) float wanted[kLanes];
-    int count = 0;
-    for (int lane = 0; lane < kLanes; ++lane) {
-      const bool is_wanted = rows == nullptr || rows[row + lane] != 0;
-      wanted[lane] = is_wanted ? 1.0f : 0.0f;
-      count += is_wanted;
-    }
-    if (count == 0) continue;
-    if (a.columns == 1) adam_rows<1>(c, a, row, load(wanted));
-    if (a.columns == 3) adam_rows<3>(c, a, row, load(wanted));
-    if (a.columns == 4) adam_rows<4>(c, a, row, load(wanted));
+constexpr ptrdiff_t kStretch = 64 * kLanes;  // rows that a thread takes at a time
+
+// Rows from .. from + count - 1; `wanted` is 1 or 0 for each of them.
+inline void adam_stretch(const AdamConstants& c, const AdamArrays& a, const float* wanted,
+                         ptrdiff_t from, ptrdiff_t count) {
+  const bool by_vectors = a.columns == 1 || a.columns == 3 || a.columns == 4;
+  ptrdiff_t row = 0;
+  for (; by_vectors && row + kLanes <= count; row += kLanes) {
+    const Lanes rows = load(wanted + row);
+    if (!any(rows > 0.0f)) continue;
+    if (a.columns == 1) adam_rows<1>(c, a, from + row, rows);
+    if (a.columns == 3) adam_rows<3>(c, a, from + row, rows);
+    if (a.columns == 4) adam_rows<4>(c, a, from + row, rows);
   }
-  for (; row < to; ++row)
-    if (rows == nullptr || rows[row])
-      for (ptrdiff_t k = 0; k < a.columns; ++k) adam_one(c, a, row * a.columns + k);
+  for (; row < count; ++row)
+    if (wanted[row] > 0.0f)
+      for (ptrdiff_t k = 0; k < a.columns; ++k) adam_one(c, a, (from + row) * a.columns + k);
 }
 
 // `groups`: tuples (params, grads, first, second, rate) with the same number of rows.
@@ -107,11 +104,14 @@ inline void adam_steps(const std::vector<pybind11::tuple>& groups, int step,
           ? nullptr
           : mask.cast<pybind11::array_t<uint8_t, pybind11::array::c_style>>().data();
   pybind11::gil_scoped_release release;
-  const ptrdiff_t stretch = 64 * kLanes;
 #pragma omp parallel for schedule(static) num_threads(threads)
-  for (ptrdiff_t from = 0; from < count; from += stretch)
-    for (const AdamArrays& a : arrays)
-      adam_stretch(c, a, rows, from, from + stretch < count ? from + stretch : count);
+  for (ptrdiff_t from = 0; from < count; from += kStretch) {
+    const ptrdiff_t here = from + kStretch < count ? kStretch : count - from;
+    alignas(64) float wanted[kStretch];
+    for (ptrdiff_t row = 0; row < here; ++row)
+      wanted[row] = rows == nullptr ? 1.0f : static_cast<float>(rows[from + row]);
+    for (const AdamArrays& a : arrays) adam_stretch(c, a, wanted, from, here);
+  }
 }
 
 }  // namespace bdgs
