@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,8 @@ from bdgs_ros.mapping.rasterize import FusedResult, LossWeights, adam_step, fuse
 Array = NDArray[np.float32]
 
 _POSE_BETAS = (0.9, 0.99)  # a pose is seen in few steps, so the second moment must be fast
+
+Plan = list[tuple[MapKeyframe, int]]
 
 
 class Optimiser:
@@ -65,8 +67,16 @@ class Optimiser:
         visible = gaussians.visible_mask()
         # Gaussians that Eq. 11 hides are frozen, opacity too, so that they can come back.
         penalised = visible & (gaussians.states == State.DYNAMIC)
-        schedule = self._schedule(newest, others)
-        return [self._step(gaussians, kf, level, visible, penalised) for kf, level in schedule]
+        coarse, fine = self._plan(newest, others)
+
+        def steps(plan: Plan) -> list[float]:
+            return [self._step(gaussians, kf, level, visible, penalised) for kf, level in plan]
+
+        losses = steps(coarse)
+        seen = [loss for (kf, level), loss in zip(coarse, losses, strict=True) if kf is newest]
+        if _gain(seen[len(seen) // 2 :]) < self._config.enough:
+            fine = fine[: self._config.min_fine]
+        return losses + steps(fine)
 
     def step(
         self,
@@ -94,20 +104,22 @@ class Optimiser:
         penalised = visible & (gaussians.states == State.DYNAMIC)
         return self._step(gaussians, keyframe, level_index, visible, penalised, rate_scale)
 
-    def _schedule(
-        self, newest: MapKeyframe, others: Sequence[MapKeyframe]
-    ) -> Iterator[tuple[MapKeyframe, int]]:
-        """Yield the keyframe and pyramid level of each iteration, i = L, ..., 0 as in Eq. 12."""
-        for i, level in enumerate(self._levels(len(newest.levels))):
-            keyframe = newest if i % 2 == 0 or not others else others[(i // 2) % len(others)]
-            yield keyframe, level
+    def _plan(self, newest: MapKeyframe, others: Sequence[MapKeyframe]) -> tuple[Plan, Plan]:
+        """Return keyframe and pyramid level of each iteration: coarse ones, finest ones."""
+        levels = self._levels(len(newest.levels))
+        plan = [
+            (newest if i % 2 == 0 or not others else others[(i // 2) % len(others)], level)
+            for i, level in enumerate(levels)
+        ]
+        first_fine = levels.index(0) if 0 in levels else len(levels)
+        return plan[:first_fine], plan[first_fine:]
 
-    def _levels(self, count: int) -> Iterator[int]:
+    def _levels(self, count: int) -> list[int]:
+        """Return the level of each iteration, i = L, ..., 0 as in Eq. 12."""
         coarse = round(self._config.iterations * self._config.pyramid.coarse_share)
-        for level in range(count - 1, 0, -1):
-            yield from [level] * (coarse // (count - 1))
-        done = coarse // max(count - 1, 1) * (count - 1)
-        yield from [0] * (self._config.iterations - done)
+        each = coarse // max(count - 1, 1)
+        levels = [level for level in range(count - 1, 0, -1) for _ in range(each)]
+        return levels + [0] * (self._config.iterations - len(levels))
 
     def _step(
         self,
@@ -226,3 +238,8 @@ class Optimiser:
         first, second = keyframe.pose_moments
         adam_step(xi, gradient.astype(np.float32), first, second, rate=rate, betas=_POSE_BETAS)
         keyframe.move(xi)
+
+
+def _gain(losses: Sequence[float]) -> float:
+    """Return the share by which a loss fell; infinite where too little is known."""
+    return 1 - losses[-1] / losses[0] if len(losses) > 1 and losses[0] > 0 else float('inf')

@@ -132,6 +132,12 @@ class MappingConfig:
         76800, 'of a larger image, one step sees a window of this many', unit='px', low=400
     )
     iterations: int = param(40, 'optimisation steps per keyframe', low=0, high=1000)
+    enough: float = param(
+        0.1, 'with less gain at the last coarse level only min_fine iterations follow', high=1.0
+    )
+    min_fine: int = param(
+        8, 'iterations at the finest level where the residual says enough', low=0, high=1000
+    )
     window: int = param(8, 'newest keyframes in every optimisation', low=1, high=64)
     keyframes: int = param(
         64, 'keyframes whose images are kept; of others only the Gaussians', low=2, high=100000
