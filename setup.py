@@ -54,17 +54,18 @@ def native_extensions():
         )
         for name, flags in RASTERIZER_FLAGS.items()
     ]
-    modules.append(
+    modules += [
         Extension(
-            f'{NAME}._aligner',
-            [os.path.join(ROOT, 'src', 'aligner.cpp')],
+            f'{NAME}._{name}',
+            [os.path.join(ROOT, 'src', f'{name}.cpp')],
             include_dirs=include,
             extra_compile_args=COMPILE,
             extra_link_args=['-fopenmp'],
             language='c++',
             optional=True,
         )
-    )
+        for name in ('aligner', 'harmonics')
+    ]
     return [m for m in modules if os.path.exists(m.sources[0])]
 
 

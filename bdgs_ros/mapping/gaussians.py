@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 from bdgs_ros.belief.filter import logit, render_mask
 from bdgs_ros.belief.fusion import BeliefTracker, decide
 from bdgs_ros.core.config import BeliefConfig
+from bdgs_ros.mapping.harmonics import Shading, functions, resized
 from bdgs_ros.mapping.rasterize import Gaussians
 
 Array = NDArray[np.float32]
 Scalar = TypeVar('Scalar', np.float32, np.int32)
 
-PARAMETERS = ('means', 'quats', 'log_scales', 'logit_opacities', 'colors')
+RASTERISED = ('means', 'quats', 'log_scales', 'logit_opacities', 'colors')
+PARAMETERS = (*RASTERISED, 'harmonics')
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ class GaussianMap:
     and `confirmations` are what pruning remembers (`bdgs_ros.mapping.prune`), not saved.
     """
 
-    def __init__(self, config: BeliefConfig) -> None:
+    def __init__(self, config: BeliefConfig, degree: int = 0) -> None:
         self._config = config
         self.parameters: dict[str, Array] = {
             'means': np.zeros((0, 3), np.float32),
@@ -48,6 +50,7 @@ class GaussianMap:
             'log_scales': np.zeros((0, 3), np.float32),
             'logit_opacities': np.zeros(0, np.float32),
             'colors': np.zeros((0, 3), np.float32),
+            'harmonics': np.zeros((0, 3 * functions(degree)), np.float32),
         }
         self.moments = {name: _moments_like(self.parameters[name]) for name in PARAMETERS}
         self.belief = BeliefTracker(config)
@@ -87,6 +90,11 @@ class GaussianMap:
         return self.parameters['colors']
 
     @property
+    def harmonics(self) -> Array:
+        """View-dependent colour, [N, 3 K] in the order of `Shading`; K is 0 without."""
+        return self.parameters['harmonics']
+
+    @property
     def p_dynamic(self) -> Array:
         """The smoothed posterior of Eq. 10, [N]."""
         return self.belief.smoothed
@@ -100,9 +108,26 @@ class GaussianMap:
         """Return M_g of Eq. 11, [N]: True where a Gaussian is rendered."""
         return render_mask(self.belief.smoothed, self._config.mask_threshold)
 
-    def as_gaussians(self) -> Gaussians:
-        """Return the arrays in the form the rasteriser takes; nothing is copied."""
-        return Gaussians(**self.parameters, p_dynamic=self.p_dynamic)
+    def as_gaussians(
+        self, shading: Shading | None = None, active: NDArray[np.bool_] | None = None
+    ) -> Gaussians:
+        """Return the arrays as the rasteriser takes them; only shaded colours are not shared."""
+        arrays = {name: self.parameters[name] for name in RASTERISED}
+        if shading is not None:
+            drawn = np.ones(len(self), bool) if active is None else active
+            arrays['colors'] = shading.colors(self.colors, drawn)
+        return Gaussians(**arrays, p_dynamic=self.p_dynamic)
+
+    def shading(self, T_camera_world: NDArray[np.float64], threads: int) -> Shading | None:
+        """Return how a camera sees the colours; None where they are the same from everywhere."""
+        if self.harmonics.shape[1] == 0:
+            return None
+        return Shading(self.means, self.harmonics, T_camera_world, threads=threads)
+
+    def resize_colors(self, degree: int) -> None:
+        """Give the view-dependent colour another degree; what it is optimised with starts anew."""
+        self.parameters['harmonics'] = resized(self.harmonics, degree)
+        self.moments['harmonics'] = _moments_like(self.harmonics)
 
     def append(self, new: NewGaussians, opacity: float, keyframe_index: int) -> None:
         """Add Gaussians that came with keyframe number `keyframe_index`."""
@@ -113,6 +138,7 @@ class GaussianMap:
             'log_scales': _three(np.log(new.scales)),
             'logit_opacities': np.full(count, logit(np.array([opacity], np.float32))[0]),
             'colors': new.colors,
+            'harmonics': np.zeros((count, self.harmonics.shape[1])),
         }
         for name in PARAMETERS:
             block = added[name].astype(np.float32)

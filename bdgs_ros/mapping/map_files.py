@@ -59,7 +59,9 @@ def save_map(path: Path, gaussians: GaussianMap, kept: KeyframeSet | None = None
         ) from error
 
 
-def load_map(path: Path, config: BeliefConfig, levels: int) -> tuple[GaussianMap, KeyframeSet]:
+def load_map(
+    path: Path, config: BeliefConfig, levels: int, degree: int | None = None
+) -> tuple[GaussianMap, KeyframeSet]:
     """
     Read a map and, where there are any, its keyframes.
 
@@ -71,6 +73,8 @@ def load_map(path: Path, config: BeliefConfig, levels: int) -> tuple[GaussianMap
         Of the filter.
     levels : int
         Of the pyramid of each keyframe.
+    degree : int, optional
+        Of view-dependent colour; None: that of the file.
 
     Returns
     -------
@@ -85,7 +89,7 @@ def load_map(path: Path, config: BeliefConfig, levels: int) -> tuple[GaussianMap
         If a file is missing, damaged, or belongs to another map.
 
     """
-    gaussians = load_ply(path, config)
+    gaussians = load_ply(path, config, degree)
     newest = int(gaussians.keyframe_index.max()) if len(gaussians) else -1
     folder = _folder_of(path, len(gaussians))
     if folder is None:

@@ -62,7 +62,7 @@ class Mapper:
 
     def reset(self) -> None:
         """Forget the map."""
-        self.map = GaussianMap(self._belief)
+        self.map = GaussianMap(self._belief, self._config.color.degree)
         self.keyframes: list[MapKeyframe] = []
         self.history = History()
         self.vignette = Vignette()
@@ -120,9 +120,11 @@ class Mapper:
         active: Mask | None,
         statistics: bool = False,
     ) -> Rendered:
+        T_camera_world = se3.inverse(T_world_camera)
+        shading = self.map.shading(T_camera_world, self._config.threads)
         return render(
-            self.map.as_gaussians(),
-            se3.inverse(T_world_camera),
+            self.map.as_gaussians(shading, active),
+            T_camera_world,
             camera,
             active=active,
             statistics=statistics,
@@ -344,7 +346,9 @@ class Mapper:
             If it cannot be read; the mapper then keeps the map it has.
 
         """
-        loaded, kept = load_map(Path(path), self._belief, self._config.pyramid.levels)
+        loaded, kept = load_map(
+            Path(path), self._belief, self._config.pyramid.levels, self._config.color.degree
+        )
         self.reset()
         self.map = loaded
         self.keyframes = list(kept.keyframes)

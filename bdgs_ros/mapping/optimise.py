@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from bdgs_ros.belief.fusion import State
 from bdgs_ros.core.config import MappingConfig
 from bdgs_ros.mapping import losses
-from bdgs_ros.mapping.gaussians import PARAMETERS, GaussianMap
+from bdgs_ros.mapping.gaussians import RASTERISED, GaussianMap
+from bdgs_ros.mapping.harmonics import Shading
 from bdgs_ros.mapping.keyframes import Level, MapKeyframe, Window
-from bdgs_ros.mapping.rasterize import FusedResult, LossWeights, adam_step, fused_step
+from bdgs_ros.mapping.rasterize import FusedResult, Gaussians, LossWeights, adam_step, fused_step
 
 Array = NDArray[np.float32]
 
@@ -34,6 +35,7 @@ class Optimiser:
             empty=config.loss.empty,
         )
         self._rng = np.random.default_rng(config.seed)
+        self._scratch = np.empty((0, 0), np.float32)  # kept: fresh memory is slow
         rate = config.rate
         self._rates = {
             'means': rate.means,
@@ -132,10 +134,15 @@ class Optimiser:
     ) -> float:
         level = self._look(keyframe.levels[level_index])
         active = visible & self._opaque_enough(gaussians.logit_opacities, level_index)
-        result = self._photometric(gaussians, keyframe, level, active)
-        gradients = dict(zip(PARAMETERS, result.gradients.parameters(), strict=True))
+        shading = gaussians.shading(keyframe.T_camera_world, self._config.threads)
+        shaded = gaussians.as_gaussians(shading, active)
+        result = self._photometric(shaded, keyframe, level, active)
+        gradients = dict(zip(RASTERISED, result.gradients.parameters(), strict=True))
         regulariser = self._add_direct_terms(gaussians, gradients, level, penalised)
         self._adam(gaussians, gradients, (result.visibility > 0) | penalised, rate_scale)
+        if shading is not None:
+            seen = result.visibility > 0
+            self._adapt_shading(gaussians, shading, gradients['colors'], seen, rate_scale)
         self._adapt_exposure(keyframe, result.exposure_gradient, rate_scale)
         self._adapt_pose(keyframe, result.gradients.pose, rate_scale)
         return result.loss + regulariser
@@ -165,14 +172,14 @@ class Optimiser:
 
     def _photometric(
         self,
-        gaussians: GaussianMap,
+        gaussians: Gaussians,
         keyframe: MapKeyframe,
         level: Level,
         active: NDArray[np.bool_],
     ) -> FusedResult:
         """Lambda_psim times Eq. 9 plus the depth term, on pixels where nothing moves."""
         return fused_step(
-            gaussians.as_gaussians(),
+            gaussians,
             keyframe.T_camera_world,
             level.camera,
             level.color,
@@ -210,7 +217,7 @@ class Optimiser:
         touched: NDArray[np.bool_],
         rate_scale: float,
     ) -> None:
-        for name in PARAMETERS:
+        for name in RASTERISED:
             adam_step(
                 gaussians.parameters[name],
                 gradients[name],
@@ -218,6 +225,26 @@ class Optimiser:
                 rate=rate_scale * self._rates[name],
                 rows=touched,
             )
+
+    def _adapt_shading(
+        self,
+        gaussians: GaussianMap,
+        shading: Shading,
+        by_color: Array,
+        seen: NDArray[np.bool_],
+        rate_scale: float,
+    ) -> None:
+        """Fit what depends on the direction; only where it is seen, the rest stays as it is."""
+        if self._scratch.shape != gaussians.harmonics.shape:
+            self._scratch = np.empty_like(gaussians.harmonics)
+        shading.gradient(by_color, seen, self._scratch)
+        adam_step(
+            gaussians.harmonics,
+            self._scratch,
+            *gaussians.moments['harmonics'],
+            rate=rate_scale * self._config.rate.harmonics,
+            rows=seen,
+        )
 
     def _adapt_exposure(self, keyframe: MapKeyframe, gradient: Array, rate_scale: float) -> None:
         """Fit gain and offset of a keyframe; the first keyframe defines the map's exposure."""

@@ -1,9 +1,10 @@
 """
 Maps as files: the standard 3DGS .ply, with the filter's state as further properties.
 
-Layout of the reference implementation (Kerbl et al. 2023) with spherical harmonics of degree 0:
-`x y z nx ny nz f_dc_0..2 opacity scale_0..2 rot_0..3`, all float32, opacity as logit, scale as
-natural logarithm, rot wxyz. What follows them is ours; docs/files.md says which programs pass
+Layout of the reference implementation (Kerbl et al. 2023):
+`x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3`, all float32, opacity as logit,
+scale as natural logarithm, rot wxyz; `f_rest_*`, the view-dependent colour, as far as the map has
+it. What follows them is ours; docs/files.md says which programs pass
 over it, and which need a file without (`state=False`).
 """
 
@@ -19,6 +20,7 @@ from bdgs_ros.core.config import BeliefConfig
 from bdgs_ros.core.errors import MapError
 from bdgs_ros.core.files import write_bytes
 from bdgs_ros.mapping.gaussians import GaussianMap, NewGaussians
+from bdgs_ros.mapping.harmonics import degree_of
 
 Array = NDArray[np.float32]
 Block = tuple[tuple[str, ...], Array]
@@ -61,7 +63,7 @@ def save_ply(path: Path, gaussians: GaussianMap, *, state: bool = True) -> None:
     """
     blocks = _standard_blocks(gaussians) + (_state_blocks(gaussians) if state else [])
     names = [name for block_names, _ in blocks for name in block_names]
-    columns = [array.reshape(len(gaussians), -1) for _, array in blocks]
+    columns = [array.reshape(len(gaussians), len(names_of)) for names_of, array in blocks]
     table = np.concatenate(columns, axis=1, dtype=np.float32)
     header = _header(len(gaussians), [f'float {name}' for name in names])
     try:
@@ -79,12 +81,14 @@ def _header(count: int, properties: list[str]) -> bytes:
 
 
 def _standard_blocks(gaussians: GaussianMap) -> list[Block]:
-    """Return the standard properties in their order; `f_rest_*` would follow `f_dc_*`."""
+    """Return the standard properties in their order."""
+    rest = tuple(f'f_rest_{i}' for i in range(gaussians.harmonics.shape[1]))
     quats = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
     return [
         (('x', 'y', 'z'), gaussians.means),
         (('nx', 'ny', 'nz'), np.zeros_like(gaussians.means)),
         (('f_dc_0', 'f_dc_1', 'f_dc_2'), (gaussians.colors - 0.5) / SH_C0),
+        (rest, gaussians.harmonics),
         (('opacity',), gaussians.logit_opacities),
         (('scale_0', 'scale_1', 'scale_2'), gaussians.log_scales),
         (('rot_0', 'rot_1', 'rot_2', 'rot_3'), quats),
@@ -117,9 +121,19 @@ def write_points(path: Path, gaussians: GaussianMap) -> None:
     write_bytes(path, _header(len(points), kinds), points.tobytes())
 
 
-def load_ply(path: Path, config: BeliefConfig) -> GaussianMap:
+def load_ply(path: Path, config: BeliefConfig, degree: int | None = None) -> GaussianMap:
     """
     Read a map, ours or any 3DGS .ply; without filter state every Gaussian starts as static.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file.
+    config : BeliefConfig
+        Of the filter.
+    degree : int, optional
+        Of the map's view-dependent colour, to which that of the file is extended or cut; None:
+        as in the file.
 
     Raises
     ------
@@ -132,12 +146,33 @@ def load_ply(path: Path, config: BeliefConfig) -> GaussianMap:
     missing = [n for n in STANDARD if n not in column and n not in _OPTIONAL]
     if missing:
         raise MapError(f"'{path}' is no 3DGS map: it lacks the properties {', '.join(missing)}")
-    return _from_columns(_without_broken(path, column), config)
+    rest = _rest_names(path, column, degree)
+    return _from_columns(_without_broken(path, column, rest), config, rest, degree)
 
 
-def _without_broken(path: Path, column: dict[str, Array]) -> dict[str, Array]:
+def _rest_names(path: Path, column: dict[str, Array], degree: int | None) -> tuple[str, ...]:
+    """Return the names of the view-dependent colour; none if it is not wanted or not whole."""
+    count = sum(name.startswith('f_rest_') for name in column)
+    names = tuple(f'f_rest_{i}' for i in range(count))
+    found = degree_of(count)
+    if found is None or not all(name in column for name in names):
+        _LOGGER.warning("'%s': %d f_rest properties make no degree; passed over", path, count)
+        return ()
+    if degree is not None and found > degree:
+        _LOGGER.warning(
+            "'%s' has view-dependent colour of degree %d; cut to mapping.color.degree = %d",
+            *(path, found, degree),
+        )
+    return () if degree == 0 else names
+
+
+def _without_broken(
+    path: Path, column: dict[str, Array], rest: tuple[str, ...]
+) -> dict[str, Array]:
     """Leave out Gaussians with numbers that are not finite, which some trainers produce."""
-    needed = [name for name in (*STANDARD, *STATE) if name in column and name not in _OPTIONAL]
+    needed = [
+        name for name in (*STANDARD, *rest, *STATE) if name in column and name not in _OPTIONAL
+    ]
     sound = np.all([np.isfinite(column[name]) for name in needed], axis=0)
     sound &= np.any([column[f'rot_{i}'] != 0 for i in range(4)], axis=0)
     if sound.all():
@@ -146,7 +181,9 @@ def _without_broken(path: Path, column: dict[str, Array]) -> dict[str, Array]:
     return {name: values[sound] for name, values in column.items()}
 
 
-def _from_columns(column: dict[str, Array], config: BeliefConfig) -> GaussianMap:
+def _from_columns(
+    column: dict[str, Array], config: BeliefConfig, rest: tuple[str, ...], degree: int | None
+) -> GaussianMap:
     def block(*names: str) -> Array:
         return np.ascontiguousarray(np.stack([column[n] for n in names], axis=1))
 
@@ -159,6 +196,9 @@ def _from_columns(column: dict[str, Array], config: BeliefConfig) -> GaussianMap
     gaussians.parameters['quats'] = block('rot_0', 'rot_1', 'rot_2', 'rot_3')
     gaussians.parameters['log_scales'] = block('scale_0', 'scale_1', 'scale_2')
     gaussians.parameters['logit_opacities'] = np.ascontiguousarray(column['opacity'])
+    if rest:
+        gaussians.parameters['harmonics'] = block(*rest)
+    gaussians.resize_colors((degree_of(len(rest)) or 0) if degree is None else degree)
     gaussians.belief.smoothed = column.get('p_dynamic_smoothed', belief).copy()
     zero = np.zeros(count, np.float32)
     gaussians.keyframe_index = column.get('keyframe_index', zero).astype(np.int32)

@@ -33,6 +33,7 @@ class LearningRateConfig:
     quats: float = param(0.002, 'rotations', low=0.0)
     opacities: float = param(0.05, 'logit opacities', low=0.0)
     colors: float = param(0.005, 'colours', low=0.0)
+    harmonics: float = param(0.00025, 'view-dependent part of colours', low=0.0)
     exposure: float = param(0.002, 'log gain and offset of a keyframe', low=0.0)
     pose: float = param(0.0005, 'pose of a keyframe', unit='m and rad', low=0.0)
 
@@ -120,6 +121,13 @@ class ModelConfig:
 
 
 @dataclass(frozen=True)
+class ColorConfig:
+    """View-dependent colour."""
+
+    degree: int = param(0, 'of spherical harmonics; 0: the same from everywhere', low=0, high=3)
+
+
+@dataclass(frozen=True)
 class MappingConfig:
     """The Gaussian map and its optimisation."""
 
@@ -153,3 +161,4 @@ class MappingConfig:
     prune: PruneConfig = field(default_factory=PruneConfig)
     pyramid: PyramidConfig = field(default_factory=PyramidConfig)
     model: ModelConfig = field(default_factory=ModelConfig)
+    color: ColorConfig = field(default_factory=ColorConfig)
