@@ -31,7 +31,8 @@
 //             g = alpha dL/dalpha: six moments of g and seven sums of w. So the block's pixel
 //             coordinates and gradients form a matrix with one row of 16 outputs per pixel, and
 //             the reduction over pixels is a matrix product instead of 13 horizontal sums.
-//             Sums go to the tile's slots.
+//             Sums go to the tile's slots. Walking hangs on T and R from pair to pair, products on
+//             nothing: they take turns, a few pairs at a time, so that neither waits.
 //   gather    per Gaussian: add its slots in order, and go back through the projection.
 //
 // Every sum has a fixed order (slots per Gaussian, chunks for the pose, rows for the loss), so the
@@ -566,7 +567,6 @@ class Rasterizer {
     Lanes T = splat(1.0f);
     const float* alphas = arenas_[kept.thread].alphas.data() + kept.first * kLanes;
     const uint32_t* locals = arenas_[kept.thread].locals.data() + kept.first;
-    // Walking hangs on T and R from pair to pair, products on nothing: in turns, not together.
     alignas(64) double pairs[kBatch][kLanes];
     for (uint32_t done = 0; done < kept.count; done += kBatch) {
       const uint32_t n = std::min<uint32_t>(kBatch, kept.count - done);

@@ -5,16 +5,16 @@
 //       + sum_{p: D_p > 0} w_p (depth |S| |Z / S - D|_p + empty (1 - S_p)) / sum_{p: D_p > 0} w_p
 //       + smooth sum_p w_p (e_p^h r_p^h + e_p^v r_p^v) / sum_p w_p
 //
-// |.| and SSIM are means over the three channels. Z = sum of weights times depth and S = silhouette;
-// Z / S is the depth that the map shows. The factor |S| is not differentiated: it lets what hardly
-// shows pull hardly, where Z / S - D alone would pull without bound at the rim of the map; and if it
-// were differentiated, a depth that is off would be cured by making the surface transparent. The
-// last term wants the map opaque wherever the camera measured a surface.
+// |.| and SSIM are means over the three channels. Z = sum of weights times depth and S =
+// silhouette; Z / S is the depth that the map shows. The factor |S| is not differentiated: it lets
+// what hardly shows pull hardly, where Z / S - D alone would pull without bound at the rim of the
+// map; and if it were differentiated, a depth that is off would be cured by making the surface
+// transparent. The last term wants the map opaque wherever the camera measured a surface.
 //
-// The `smooth` term is the edge-aware smoothness that stands for the image-gradient term of Eq. 8, after
-// `depth_reg` of MonoGS (Matsuki et al., 2024): there e |dZ| with e = exp(-10 |grad T|^2). A first
-// difference would turn every wall towards the camera, so here r compares a pixel's mean depth z = Z/S
-// with that of the line through its two neighbours, along the row (h) and the column (v):
+// The `smooth` term is the edge-aware smoothness that stands for the image-gradient term of Eq. 8,
+// after `depth_reg` of MonoGS (Matsuki et al., 2024): there e |dZ| with e = exp(-10 |grad T|^2). A
+// first difference would turn every wall towards the camera, so here r compares a pixel's mean
+// depth z = Z/S with that of the line through its two neighbours, along the row (h) and the column:
 //   r = |z - 2 z_- z_+ / (z_- + z_+)|      0 on any plane, because 1/z is affine in the image
 //   e = exp(-10 (|T - T_-|^2 + |T - T_+|^2)) with means over the channels
 // and counts only if all three pixels have w > 0 and S > 0.5: a hole is not a cliff.
@@ -26,9 +26,10 @@
 // respect to x is three more windows: blur(f_m/n) + 2 x blur(f_s/n) + y blur(f_c/n).
 //
 // The windows are separable, and run down the image in one sweep. A row's 13 planes (mask, x, y,
-// x^2 + y^2, x y) are blurred along the row while they are in the nearest cache and go to a ring of
-// 16 rows; four rows at a time are blurred down the ring, become SSIM and its three fields f/n, and
-// those go through a second ring in the same way. Planes of the whole image would not fit the cache.
+// x^2 + y^2, x y) are blurred along the row while they are in the nearest cache and go to a ring
+// of 16 rows; four rows at a time are blurred down the ring, become SSIM and its three fields f/n,
+// and those go through a second ring in the same way. Planes of the whole image would not fit the
+// cache.
 
 #pragma once
 
@@ -142,7 +143,7 @@ class Loss {
       window_[d] = static_cast<float>(std::exp(-d * d / 4.5) / sum);
   }
 
-  // Target and weight become planes. These are zero beyond the image, so whole vectors may overhang.
+  // Target and weight become planes. These are zero beyond the image, so vectors may overhang.
   void read_row(int y) {
     const int width = layout_.width;
     const float* weight = in_.weight + static_cast<size_t>(y) * width;

@@ -16,6 +16,9 @@
 #if defined(__AVX2__)
 #include <immintrin.h>
 #endif
+#if defined(__linux__)
+#include <sys/mman.h>
+#endif
 
 namespace bdgs {
 
@@ -177,7 +180,8 @@ inline void transpose(const Lanes* from, float* to, size_t stride) {
 #if defined(__AVX512F__)
   __m512 a[16], b[16];
   for (int k = 0; k < 16; k += 2) {  // pairs of lanes, within each quarter
-    const __m512 even = reinterpret_cast<__m512>(from[k]), odd = reinterpret_cast<__m512>(from[k + 1]);
+    const __m512 even = reinterpret_cast<__m512>(from[k]);
+    const __m512 odd = reinterpret_cast<__m512>(from[k + 1]);
     a[k] = _mm512_unpacklo_ps(even, odd);
     a[k + 1] = _mm512_unpackhi_ps(even, odd);
   }
@@ -281,6 +285,8 @@ inline void store_rows(float* array, int i, int count, const Lanes* in) {
   std::memcpy(row, rows, (count - i) * kColumns * sizeof(float));
 }
 
+constexpr size_t kHugePage = size_t{1} << 21;
+
 // An array that keeps its memory between calls and starts on a cache line.
 template <typename T>
 class Buffer {
@@ -295,9 +301,15 @@ class Buffer {
   T* reserve(size_t size, size_t keep = 0) {
     if (size <= size_) return data_;
     const size_t grown = (size + size / 2 + 63) / 64 * 64;
-    void* memory = std::aligned_alloc(64, grown * sizeof(T));
+    const size_t bytes = grown * sizeof(T);
+    const size_t page = bytes >= kHugePage ? kHugePage : 64;
+    const size_t room = (bytes + page - 1) / page * page;
+    void* memory = std::aligned_alloc(page, room);
     if (memory == nullptr) throw std::bad_alloc();
-    std::memset(memory, 0, grown * sizeof(T));
+#if defined(__linux__)
+    if (page == kHugePage) madvise(memory, room, MADV_HUGEPAGE);  // random access: fewer TLB misses
+#endif
+    std::memset(memory, 0, bytes);
     if (keep > 0) std::memcpy(memory, data_, keep * sizeof(T));
     std::free(data_);
     data_ = static_cast<T*>(memory);
