@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 from bdgs_ros.bench.harness import Cell, Options
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.mapping import rasterize
-from bdgs_ros.mapping.rasterize import Gaussians, LossWeights
+from bdgs_ros.mapping.rasterize import AdamGroup, FusedResult, Gaussians, LossWeights
 
 NAME = 'rasterizer'
 PROTOCOL = """
 A camera in a room of 6 x 4 x 2.6 m with boxes; Gaussians lie on the surfaces in view, sigma 0.8
 of their spacing, flat, opacity 0.5 to 0.98. Times are medians of at least five calls after one
-to warm up: forward (colour, depth, silhouette, posterior), backward (given image gradients), and
-fused (forward, L1, SSIM and depth loss, backward). gradient_error: largest relative difference
-(2-norm, over means, quats, scales, opacities, colours, pose) to the float64 torch twin, 1500
-Gaussians at 64x48.
+to warm up: forward (colour, depth, silhouette, posterior), backward (given image gradients),
+fused (forward, L1, SSIM and depth loss, backward), and iteration (fused, and Adam on the Gaussians
+in view). gradient_error: largest relative difference (2-norm, over means, quats, scales,
+opacities, colours, pose) to the float64 torch twin, 1500 Gaussians at 64x48.
 """
 
 _COUNTS = (20_000, 50_000, 100_000, 300_000)
@@ -36,19 +36,21 @@ _WEIGHTS = LossWeights(color=0.85, ssim=0.2, depth=0.2)
 
 
 def cells(options: Options) -> list[Cell]:
-    """List every size for the fastest native backend, and small ones for the torch twin."""
+    """List every size for gsplat and the fastest native backend, small ones for the twin."""
     counts = (2_000,) if options.quick else _COUNTS
     sizes = ((160, 120),) if options.quick else _SIZES
-    native = [name for name in rasterize.available_backends() if name != 'torch'][:1]
+    available = rasterize.available_backends()
+    native = [name for name in available if name not in ('gsplat', 'torch')][:1]
+    card = [name for name in available if name == 'gsplat']
     found = []
     for width, height in sizes:
         for count in counts:
             scene = {'gaussians': count, 'width': width, 'height': height}
             name = f'{count}_{width}x{height}'
-            for backend in (*native, 'torch'):
+            for backend in (*card, *native, 'torch'):
                 if backend == 'torch' and count * width * height > _TWIN_LIMIT:
                     continue
-                for threads in (1,) if backend == 'torch' else _THREADS:
+                for threads in _THREADS if backend in native else (1,):
                     settings = {**scene, 'backend': backend, 'threads': threads}
                     found.append(Cell(name, f'{backend}_{threads}', 0, settings))
     return found
@@ -64,6 +66,12 @@ def run_cell(cell: Cell, options: Options) -> dict[str, Any]:
     ones = np.ones(camera.shape, np.float32)
     color = np.clip(target.color + 0.05, 0, 1)
     gradients = np.sign(target.color - color), 0.1 * ones, 0.0 * ones
+
+    def fused() -> FusedResult:
+        return rasterize.fused_step(
+            scene, pose, camera, color, target.depth * 1.01, ones, _WEIGHTS, **how
+        )
+
     return {
         **{k: v for k, v in cell.settings.items() if k != 'backend'},
         'backend': how['backend'],
@@ -71,13 +79,28 @@ def run_cell(cell: Cell, options: Options) -> dict[str, Any]:
         'backward_ms': _time(
             lambda: rasterize.backward(scene, pose, camera, *gradients, **how),
         ),
-        'fused_ms': _time(
-            lambda: rasterize.fused_step(
-                scene, pose, camera, color, target.depth * 1.01, ones, _WEIGHTS, **how
-            )
-        ),
+        'fused_ms': _time(fused),
+        'iteration_ms': _time(_iteration(fused, scene, how)),
         'gradient_error': gradient_error(how['backend'], how['threads']),
     }
+
+
+def _iteration(
+    fused: Callable[[], FusedResult], scene: Gaussians, how: dict[str, Any]
+) -> Callable[[], None]:
+    """Return a step of the map's optimisation, with rates that leave the scene as it is."""
+    params = scene.arrays()[:5]
+    moments = [(np.zeros_like(p), np.zeros_like(p)) for p in params]
+
+    def iteration() -> None:
+        result = fused()
+        groups = [
+            AdamGroup(p, g, *m, rate=0.0)
+            for p, g, m in zip(params, result.gradients.parameters(), moments, strict=True)
+        ]
+        rasterize.adam_steps(groups, rows=result.visibility > 0, **how)
+
+    return iteration
 
 
 def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -86,7 +109,10 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     for row in rows:
         size = row['gaussians'], row['width'], row['height']
         if size == (50_000, 320, 240) and row['backend'] != 'torch':
-            summary[f'fused_ms_50k_320x240_{row["threads"]}_threads'] = row['fused_ms']
+            for what in ('fused', 'iteration'):
+                name = f'{what}_ms_50k_320x240_{row["threads"]}_threads'
+                suffix = '_gsplat' if row['backend'] == 'gsplat' else ''
+                summary[name + suffix] = row.get(f'{what}_ms')
     errors = [row['gradient_error'] for row in rows if row['gradient_error'] is not None]
     if errors:
         summary['gradient_error_max'] = max(errors)
