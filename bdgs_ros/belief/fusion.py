@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -87,6 +88,22 @@ class BeliefTracker:
         self.smoothed = self.smoothed[mask]
         for view in self._views:
             view.evidence = view.evidence[mask]
+
+    def pool(self, mean: Callable[[Array], Array]) -> None:
+        """
+        Replace groups of Gaussians by one each.
+
+        Parameters
+        ----------
+        mean : callable
+            Takes values of all Gaussians, shape (N,), to those of the groups, shape (M,).
+
+        """
+        self._base = mean(self._base)
+        self.belief = mean(self.belief)
+        self.smoothed = mean(self.smoothed)
+        for view in self._views:
+            view.evidence = mean(view.evidence)
 
     def observe(self, stamp_ns: int, T_world_camera: Pose, evidence: Array) -> None:
         """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -11,8 +12,11 @@ from numpy.typing import NDArray
 from bdgs_ros.belief.filter import logit, render_mask
 from bdgs_ros.belief.fusion import BeliefTracker, decide
 from bdgs_ros.core.config import BeliefConfig
+from bdgs_ros.core.types import Pose
+from bdgs_ros.mapping.groups import Groups
 from bdgs_ros.mapping.harmonics import Shading, functions, resized
 from bdgs_ros.mapping.rasterize import Gaussians
+from bdgs_ros.mapping.rotations import multiply, quats_from_axes
 
 Array = NDArray[np.float32]
 Scalar = TypeVar('Scalar', np.float32, np.int32)
@@ -166,6 +170,51 @@ class GaussianMap:
         self.contribution = self.contribution[mask]
         self.checks = self.checks[mask]
         self.confirmations = self.confirmations[mask]
+
+    def pool(self, groups: Groups, parameters: dict[str, Array]) -> None:
+        """
+        Replace groups of Gaussians by one each.
+
+        Parameters
+        ----------
+        groups : Groups
+            N Gaussians in M groups.
+        parameters : dict of str to ndarray
+            What the groups become, by the names in `PARAMETERS`, [M, ...] each.
+
+        """
+        for name in PARAMETERS:
+            self.parameters[name] = np.ascontiguousarray(parameters[name], np.float32)
+            self.moments[name] = [m[groups.leader] for m in self.moments[name]]
+        self.belief.pool(groups.mean)
+        self.keyframe_index = groups.least(self.keyframe_index)
+        self.observations = groups.most(self.observations)
+        self.contribution = groups.most(self.contribution)
+        self.checks = groups.most(self.checks)
+        self.confirmations = groups.most(self.confirmations)
+
+    def deform(self, transforms: Mapping[int, Pose]) -> None:
+        """
+        Move Gaussians with the keyframes that brought them, as after a loop closure.
+
+        Means and orientations turn with their keyframe; shapes stay, and so does view-dependent
+        colour: a loop closure turns by little.
+
+        Parameters
+        ----------
+        transforms : mapping of int to ndarray, shape (4, 4)
+            `T_new_old` in world by keyframe index: `p_new = T_new_old @ p_old`. Gaussians of
+            keyframes that are not named stay where they are.
+
+        """
+        index, inverse = np.unique(self.keyframe_index, return_inverse=True)
+        identity = np.eye(4)
+        T = np.array([transforms.get(int(i), identity) for i in index]).reshape(-1, 4, 4)
+        turn = quats_from_axes(T[:, :3, :3].astype(np.float32))[inverse.reshape(-1)]
+        T = T[inverse.reshape(-1)]
+        means = np.einsum('nij,nj->ni', T[:, :3, :3], self.means) + T[:, :3, 3]
+        self.parameters['means'] = np.ascontiguousarray(means, np.float32)
+        self.parameters['quats'] = multiply(turn, self.quats)
 
     def megabytes(self) -> float:
         """Return the size of the parameters and beliefs in memory, without optimiser state."""

@@ -10,6 +10,7 @@ from bdgs_ros.core.config.mapping import InsertConfig
 from bdgs_ros.mapping.cells import Cells, average, choose_cells
 from bdgs_ros.mapping.gaussians import NewGaussians
 from bdgs_ros.mapping.keyframes import Level, MapKeyframe
+from bdgs_ros.mapping.rotations import quats_from_axes
 from bdgs_ros.mapping.surface import Surface
 
 Array = NDArray[np.float32]
@@ -98,40 +99,3 @@ def _shapes(
     thickness = np.where(oriented, np.float32(config.flatness), one)
     scales = width[:, None] * np.stack([one, np.where(oriented, stretch, one), thickness], axis=1)
     return axes, scales.astype(np.float32)
-
-
-def quats_from_axes(axes: Array) -> Array:
-    """
-    Return the unit quaternions of rotation matrices.
-
-    Parameters
-    ----------
-    axes : ndarray, shape (M, 3, 3)
-        Right-handed orthonormal axes as columns.
-
-    Returns
-    -------
-    quats : ndarray, shape (M, 4)
-        wxyz.
-
-    """
-    xx, yy, zz = axes[:, 0, 0], axes[:, 1, 1], axes[:, 2, 2]
-    # Each row is a multiple of the quaternion, 4 q_i q; the one with the largest q_i is safe.
-    skew = [
-        axes[:, 2, 1] - axes[:, 1, 2],
-        axes[:, 0, 2] - axes[:, 2, 0],
-        axes[:, 1, 0] - axes[:, 0, 1],
-    ]
-    xy, xz, yz = (axes[:, i, j] + axes[:, j, i] for i, j in ((0, 1), (0, 2), (1, 2)))
-    rows = np.stack(
-        [
-            np.stack([1 + xx + yy + zz, *skew], axis=1),
-            np.stack([skew[0], 1 + xx - yy - zz, xy, xz], axis=1),
-            np.stack([skew[1], xy, 1 - xx + yy - zz, yz], axis=1),
-            np.stack([skew[2], xz, yz, 1 - xx - yy + zz], axis=1),
-        ],
-        axis=1,
-    )
-    best = np.argmax(np.einsum('mii->mi', rows), axis=1)
-    quats = rows[np.arange(len(rows)), best]
-    return np.asarray(quats / np.linalg.norm(quats, axis=1, keepdims=True), np.float32)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -38,6 +39,7 @@ from bdgs_ros.mapping.keyframes import (
 )
 from bdgs_ros.mapping.lift import lift
 from bdgs_ros.mapping.map_files import load_map, save_map
+from bdgs_ros.mapping.merge import merge_down_to
 from bdgs_ros.mapping.optimise import Optimiser
 from bdgs_ros.mapping.rasterize import Rendered, render
 from bdgs_ros.mapping.surface import fit_surface
@@ -253,10 +255,31 @@ class Mapper:
         grow(usable & new, self._belief.initial_in_front)
 
     def _thin(self) -> None:
-        """Take out what is of no use, and the least useful beyond the budget."""
-        config = self._config.prune
-        self.map.keep(prune.worth_keeping(self.map, config))
-        self.map.keep(~prune.faintest(self.map, len(self.map) - config.max_gaussians))
+        """Take out what is of no use; over the budget, merge neighbours, then drop the least."""
+        budget = self._config.prune.max_gaussians
+        self.map.keep(prune.worth_keeping(self.map, self._config.prune))
+        if len(self.map) > budget:
+            config = self._config.merge
+            merge_down_to(self.map, round(config.share * budget), config)
+        self.map.keep(~prune.least_useful(self.map, len(self.map) - budget))
+
+    def correct_poses(self, transforms: Mapping[int, Pose]) -> None:
+        """
+        Move keyframes and, with them, the Gaussians that they brought: loop closure.
+
+        Parameters
+        ----------
+        transforms : mapping of int to ndarray, shape (4, 4)
+            `T_new_old` in world by `MapKeyframe.index`, also of keyframes whose images are
+            forgotten; what is not named stays.
+
+        """
+        self.map.deform(transforms)
+        for keyframe in self.keyframes:
+            T_new_old = transforms.get(keyframe.index)
+            if T_new_old is not None:
+                keyframe.T_world_camera = T_new_old @ keyframe.T_world_camera
+        self.history.refresh(self.keyframes)
 
     def _companions(self) -> list[MapKeyframe]:
         """Return the window and as many older keyframes at random, in random order."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from bdgs_ros.belief.filter import sigmoid
 from bdgs_ros.belief.likelihood import FEATURES, Features
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.config import BeliefConfig
@@ -113,10 +114,16 @@ def confirmed_gone(gaussians: GaussianMap, seen_through: Mask, config: BeliefCon
     return np.asarray((gaussians.belief.smoothed > config.delete_above) & seen_through)
 
 
-def faintest(gaussians: GaussianMap, count: int) -> Mask:
-    """Return the `count` Gaussians that add least to what cameras see, [N]."""
+def usefulness(gaussians: GaussianMap) -> Array:
+    """Return opacity times contribution, [N]: by this the map is ranked when it is too large."""
+    opacity = sigmoid(gaussians.logit_opacities)
+    return np.asarray(opacity * np.maximum(gaussians.contribution, 1e-3), np.float32)
+
+
+def least_useful(gaussians: GaussianMap, count: int) -> Mask:
+    """Return the `count` Gaussians of least use, none if `count` is negative, [N]."""
     found = np.zeros(len(gaussians), bool)
     if count > 0:
-        worth = gaussians.logit_opacities + np.log(np.maximum(gaussians.contribution, 1e-3))
-        found[np.argpartition(worth, min(count, len(worth)) - 1)[:count]] = True
+        rank = usefulness(gaussians)
+        found[np.argpartition(rank, min(count, len(rank)) - 1)[:count]] = True
     return found

@@ -9,7 +9,8 @@ from bdgs_ros.core import se3
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.config import MappingConfig
 from bdgs_ros.mapping.keyframes import MapKeyframe, build_levels
-from bdgs_ros.mapping.lift import lift, quats_from_axes
+from bdgs_ros.mapping.lift import lift
+from bdgs_ros.mapping.rotations import axes_from_quats
 from bdgs_ros.mapping.surface import Surface, fit_surface
 
 CAMERA = PinholeCamera(64, 48, 60.0, 60.0, 31.5, 23.5)
@@ -25,24 +26,6 @@ def seen(depth: np.ndarray, T: np.ndarray) -> tuple[MapKeyframe, Surface]:
     tolerance = np.full(CAMERA.shape, 0.01, np.float32)
     surface = fit_surface(levels[0].depth_m, depth > 0, CAMERA, 4, tolerance)
     return keyframe, surface
-
-
-def rotations(quats: np.ndarray) -> np.ndarray:
-    w, x, y, z = quats.T
-    return np.stack(
-        [
-            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], 1),
-            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], 1),
-            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1),
-        ],
-        axis=1,
-    )
-
-
-def test_quaternions_of_rotations_of_any_angle() -> None:
-    rng = np.random.default_rng(0)
-    axes = np.array([se3.exp(np.r_[0, 0, 0, rng.uniform(-3, 3, 3)])[:3, :3] for _ in range(200)])
-    np.testing.assert_allclose(rotations(quats_from_axes(axes)), axes, atol=1e-5)
 
 
 def test_lifted_gaussians_project_back_to_their_pixels() -> None:
@@ -67,7 +50,7 @@ def test_gaussians_on_a_slanted_wall_lie_in_it(tilt: float) -> None:
     new = lift(keyframe, keyframe.levels[0], surface, surface.flat, 0.3, FINE)
     assert new.quats is not None
     world_normal = T[:3, :3] @ normal
-    axis = rotations(new.quats)
+    axis = axes_from_quats(new.quats)
     assert np.abs(axis[:, :, 2] @ world_normal).min() > 0.999
     distance = (new.means - T[:3, 3]) @ world_normal + 2.0
     assert np.abs(distance).max() < 5e-3
@@ -93,7 +76,7 @@ def test_seen_from_where_it_came_a_gaussian_is_round() -> None:
         replace(FINE, flatness=0.01, max_slant=100.0),
     )
     assert new.quats is not None
-    half = rotations(new.quats) * new.scales[:, None, :]
+    half = axes_from_quats(new.quats) * new.scales[:, None, :]
     z = new.means[:, 2]
     zero = np.zeros_like(z)
     jacobian = np.stack(

@@ -127,6 +127,29 @@ def test_frozen_map_answers_but_does_not_change() -> None:
     np.testing.assert_array_equal(mapper.map.means, before)
 
 
+def test_corrected_poses_take_the_map_along() -> None:
+    mapper = Mapper(CONFIG.mapping, CONFIG.belief)
+    for i, T in enumerate(poses(3)):
+        mapper.process(Keyframe(wall(i * SECOND, T), T, no_prior()))
+    before = [kf.T_world_camera.copy() for kf in mapper.keyframes]
+    seen = mapper.render(before[1], CAMERA).color
+    T_new_old = se3.exp(np.array([0.1, 0, 0, 0, 0.2, 0]))
+    mapper.correct_poses(dict.fromkeys(range(3), T_new_old))
+    for kf, T in zip(mapper.keyframes, before, strict=True):
+        np.testing.assert_allclose(kf.T_world_camera, T_new_old @ T)
+    again = mapper.render(T_new_old @ before[1], CAMERA).color
+    np.testing.assert_allclose(again, seen, atol=5e-3)
+
+
+def test_the_map_keeps_to_its_budget() -> None:
+    config = with_values(CONFIG, {'mapping.prune.max_gaussians': 1500})
+    mapper = Mapper(config.mapping, config.belief)
+    for i, T in enumerate(poses(5)):
+        mapper.process(Keyframe(wall(i * SECOND, T), T, no_prior()))
+        assert len(mapper.map) <= 1500
+    assert mapper.render(poses(5)[2], CAMERA).silhouette[8:-8, 8:-8].min() > 0.5
+
+
 def test_without_mapping_there_is_no_view() -> None:
     mapper = Mapper(replace(MappingConfig(), enabled=False), BeliefConfig())
     assert mapper.process(Keyframe(wall(0, np.eye(4)), np.eye(4), no_prior())) is None

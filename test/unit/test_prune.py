@@ -47,9 +47,9 @@ def test_needles_go_and_flat_ones_stay() -> None:
 def test_over_the_budget_the_least_useful_go() -> None:
     gaussians = small_map([0.3 + 0.004 * i for i in range(120)], [0.01] * 120)
     gaussians.contribution[100:110] = 0.01
-    gone = prune.faintest(gaussians, 20)
+    gone = prune.least_useful(gaussians, 20)
     assert gone.tolist() == [i < 10 or 100 <= i < 110 for i in range(120)]
-    assert not prune.faintest(gaussians, -5).any()
+    assert not prune.least_useful(gaussians, -5).any()
 
 
 def test_what_adds_to_no_view_of_its_surface_is_redundant() -> None:

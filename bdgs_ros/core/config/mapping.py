@@ -101,6 +101,17 @@ class PruneConfig:
 
 
 @dataclass(frozen=True)
+class MergeConfig:
+    """How neighbours become one when the map has more Gaussians than `prune.max_gaussians`."""
+
+    share: float = param(0.9, 'of the budget that is left after merging', low=0.1, high=1.0)
+    reach: float = param(
+        0.5, 'cells of the first round over the size of Gaussians; doubled twice', low=0.01
+    )
+    color: float = param(0.05, 'greatest difference of colour from the heavier neighbour', low=0.0)
+
+
+@dataclass(frozen=True)
 class PyramidConfig:
     """Coarse to fine, Eq. 12 and 13."""
 
@@ -159,6 +170,7 @@ class MappingConfig:
     rate: LearningRateConfig = field(default_factory=LearningRateConfig)
     insert: InsertConfig = field(default_factory=InsertConfig)
     prune: PruneConfig = field(default_factory=PruneConfig)
+    merge: MergeConfig = field(default_factory=MergeConfig)
     pyramid: PyramidConfig = field(default_factory=PyramidConfig)
     model: ModelConfig = field(default_factory=ModelConfig)
     color: ColorConfig = field(default_factory=ColorConfig)
