@@ -80,8 +80,8 @@ class Shading:
     """
     The colours of Gaussians as one camera sees them, and their derivatives by the coefficients.
 
-    The derivative through the direction to the means and the camera is left out: the coefficients
-    of a room are small, and it changed no figure (docs/view_dependent_color.md).
+    The derivative through the direction to the means and the camera, which 3DGS adds, is left
+    out: it gained nothing where it was tried (docs/view_dependent_color.md).
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ class Shading:
     threads : int
         Of the native kernels.
     native : bool
-        Whether to use them where they were built; the twin in numpy is about five times slower.
+        Whether to use them where they were built; the twin in numpy is many times slower.
 
     """
 

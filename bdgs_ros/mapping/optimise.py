@@ -244,6 +244,7 @@ class Optimiser:
             *gaussians.moments['harmonics'],
             rate=rate_scale * self._config.rate.harmonics,
             rows=seen,
+            threads=self._config.threads,
         )
 
     def _adapt_exposure(self, keyframe: MapKeyframe, gradient: Array, rate_scale: float) -> None:
