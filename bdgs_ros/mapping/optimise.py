@@ -13,7 +13,15 @@ from bdgs_ros.mapping import losses
 from bdgs_ros.mapping.gaussians import RASTERISED, GaussianMap
 from bdgs_ros.mapping.harmonics import Shading
 from bdgs_ros.mapping.keyframes import Level, MapKeyframe, Window
-from bdgs_ros.mapping.rasterize import FusedResult, Gaussians, LossWeights, adam_step, fused_step
+from bdgs_ros.mapping.rasterize import (
+    AdamGroup,
+    FusedResult,
+    Gaussians,
+    LossWeights,
+    adam_step,
+    adam_steps,
+    fused_step,
+)
 
 Array = NDArray[np.float32]
 
@@ -217,14 +225,16 @@ class Optimiser:
         touched: NDArray[np.bool_],
         rate_scale: float,
     ) -> None:
-        for name in RASTERISED:
-            adam_step(
+        groups = [
+            AdamGroup(
                 gaussians.parameters[name],
                 gradients[name],
                 *gaussians.moments[name],
                 rate=rate_scale * self._rates[name],
-                rows=touched,
             )
+            for name in RASTERISED
+        ]
+        adam_steps(groups, rows=touched, threads=self._config.threads)
 
     def _adapt_shading(
         self,

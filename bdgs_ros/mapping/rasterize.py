@@ -359,12 +359,21 @@ def adam_steps(
         expect_shape('rows', rows, groups[0].params.shape[:1])
         rows = np.ascontiguousarray(rows, dtype=np.bool_)
     constants = AdamConstants(step or 0, betas, eps)
-    chosen = _backend(backend)
+    chosen = _adam_backend(backend)
     if isinstance(chosen, NativeBackend):
         chosen.adam_steps(checked, rows, constants, threads)
     else:
         for group in checked:
             _adam_numpy(group, rows, constants)
+
+
+def _adam_backend(name: str) -> Backend:
+    """Return who makes Adam's steps: parameters live on the CPU, also where a GPU rasterises."""
+    chosen = _backend(name)
+    natives = [v for v in available_backends() if v in VARIANTS]
+    if isinstance(chosen, NativeBackend) or name == 'torch' or not natives:
+        return chosen
+    return _backend(natives[0])
 
 
 def _checked(group: AdamGroup) -> AdamGroup:

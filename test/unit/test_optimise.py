@@ -3,7 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
+from bdgs_ros.core import se3
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.config import BeliefConfig, MappingConfig
 from bdgs_ros.mapping.gaussians import GaussianMap, NewGaussians
@@ -15,8 +17,8 @@ CAMERA = PinholeCamera(64, 48, 60.0, 60.0, 31.5, 23.5)
 CONFIG = replace(MappingConfig(), iterations=40, threads=1)
 
 
-def scene(seed: int = 0) -> tuple[GaussianMap, MapKeyframe]:
-    """Gaussians on a plane, and a keyframe of them with other colours."""
+def scene(seed: int = 0, grey: bool = True) -> tuple[GaussianMap, MapKeyframe]:
+    """Gaussians on a plane, and a keyframe of them; `grey` then takes their colours away."""
     rng = np.random.default_rng(seed)
     depth = np.full(CAMERA.shape, 2.0, np.float32)
     pixels = np.zeros(CAMERA.shape, bool)
@@ -28,7 +30,8 @@ def scene(seed: int = 0) -> tuple[GaussianMap, MapKeyframe]:
     scales = np.full(count, 0.03, np.float32)
     gaussians.append(NewGaussians(means, scales, colors, np.full(count, 0.3, np.float32)), 0.8, 0)
     image = render(gaussians.as_gaussians(), np.eye(4), CAMERA).color
-    gaussians.parameters['colors'][:] = 0.5
+    if grey:
+        gaussians.parameters['colors'][:] = 0.5
     color = (255 * np.clip(image, 0, 1)).astype(np.uint8)
     levels = build_levels(color, depth, np.zeros(CAMERA.shape, bool), CAMERA, 3)
     keyframe = MapKeyframe(1, 0, np.eye(4), np.zeros(CAMERA.shape, np.uint8), levels)
@@ -47,7 +50,9 @@ def test_levels_go_from_coarse_to_fine() -> None:
     assert levels == sorted(levels, reverse=True)
     assert len(levels) == CONFIG.iterations
     assert set(levels) == {0, 1, 2}
-    assert levels.count(0) == CONFIG.iterations - round(CONFIG.iterations * 0.4)
+    assert levels.count(0) == CONFIG.iterations - round(
+        CONFIG.iterations * CONFIG.pyramid.coarse_share
+    )
 
 
 def test_one_level_takes_all_iterations() -> None:
@@ -66,8 +71,50 @@ def test_opacity_threshold_doubles_with_each_coarser_level() -> None:
 def test_half_of_the_iterations_look_at_the_newest_keyframe() -> None:
     _, newest = scene()
     _, other = scene(1)
-    views = [kf for kf, _ in Optimiser(CONFIG)._schedule(newest, [other])]
-    assert sum(kf is newest for kf in views) == CONFIG.iterations // 2
+    coarse, fine = Optimiser(CONFIG)._plan(newest, [other])
+    assert len(coarse) + len(fine) == CONFIG.iterations
+    assert sum(kf is newest for kf, _ in coarse + fine) == CONFIG.iterations // 2
+    assert {level for _, level in fine} == {0}
+
+
+def test_fewer_iterations_where_the_coarse_ones_gain_nothing() -> None:
+    gaussians, keyframe = scene()
+    patient = replace(CONFIG, enough=-1e9)
+    assert len(Optimiser(patient).run(gaussians, keyframe, [])) == CONFIG.iterations
+    hasty = replace(CONFIG, enough=1.0, min_fine=2)
+    coarse, _ = Optimiser(hasty)._plan(keyframe, [])
+    assert len(Optimiser(hasty).run(gaussians, keyframe, [])) == len(coarse) + 2
+
+
+def test_windows_cover_a_large_image() -> None:
+    _, keyframe = scene()
+    level = keyframe.levels[0]
+    optimiser = Optimiser(replace(CONFIG, step_pixels=level.depth_m.size // 4))
+    seen = np.zeros(level.camera.shape, int)
+    camera = level.camera
+    for _ in range(200):
+        part = optimiser._look(level)
+        assert part.depth_m.size == pytest.approx(level.depth_m.size / 4, rel=0.1)
+        x, y = round(camera.cx - part.camera.cx), round(camera.cy - part.camera.cy)
+        np.testing.assert_array_equal(
+            part.image, level.image[y : y + part.camera.height, x : x + part.camera.width]
+        )
+        seen[y : y + part.camera.height, x : x + part.camera.width] += 1
+    assert seen.min() >= 10
+
+
+def test_a_keyframe_that_is_a_little_off_moves_back_but_the_first_stays() -> None:
+    for index, moves in ((0, False), (1, True)):
+        gaussians, keyframe = scene(grey=False)
+        keyframe.index = index
+        true = keyframe.T_world_camera
+        off = se3.exp(np.array([0.01, 0.0, 0.0, 0.0, 0.0, 0.0])) @ true
+        keyframe.T_world_camera = off
+        still = replace(CONFIG.rate, means=0.0, quats=0.0, scales=0.0, colors=0.0, opacities=0.0)
+        config = replace(CONFIG, rate=replace(still, pose=0.001), iterations=40, enough=-1e9)
+        Optimiser(config).run(gaussians, keyframe, [])
+        left = np.linalg.norm(keyframe.T_world_camera[:3, 3] - true[:3, 3])
+        assert (left < 0.008) == moves
 
 
 def test_hidden_gaussians_are_frozen() -> None:

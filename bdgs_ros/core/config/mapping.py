@@ -35,7 +35,7 @@ class LearningRateConfig:
     colors: float = param(0.005, 'colours', low=0.0)
     harmonics: float = param(0.00025, 'view-dependent part of colours', low=0.0)
     exposure: float = param(0.002, 'log gain and offset of a keyframe', low=0.0)
-    pose: float = param(0.0005, 'pose of a keyframe', unit='m and rad', low=0.0)
+    pose: float = param(0.001, 'pose of a keyframe', unit='m and rad', low=0.0)
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ class PyramidConfig:
 
     levels: int = param(3, 'levels of the Gaussian pyramid', low=1, high=5)
     coarse_share: float = param(
-        0.4, 'share of the iterations on the levels above the finest', low=0.0, high=1.0
+        0.2, 'share of the iterations on the levels above the finest', low=0.0, high=1.0
     )
     opacity_threshold: float = param(
         0.005, 'tau_0 of Eq. 13; doubles with each level', low=0.0, high=0.5
@@ -148,7 +148,7 @@ class MappingConfig:
         320, 'image width at which beliefs are updated and Gaussians added', unit='px', low=40
     )
     step_pixels: int = param(
-        76800, 'of a larger image, one step sees a window of this many', unit='px', low=400
+        153600, 'of a larger image, one step sees a window of this many', unit='px', low=400
     )
     iterations: int = param(40, 'optimisation steps per keyframe', low=0, high=1000)
     enough: float = param(
