@@ -225,15 +225,13 @@ class Optimiser:
         touched: NDArray[np.bool_],
         rate_scale: float,
     ) -> None:
-        groups = [
-            AdamGroup(
-                gaussians.parameters[name],
-                gradients[name],
-                *gaussians.moments[name],
-                rate=rate_scale * self._rates[name],
+        groups = []
+        for name in RASTERISED:
+            first, second = gaussians.moments[name]
+            rate = rate_scale * self._rates[name]
+            groups.append(
+                AdamGroup(gaussians.parameters[name], gradients[name], first, second, rate)
             )
-            for name in RASTERISED
-        ]
         adam_steps(groups, rows=touched, threads=self._config.threads)
 
     def _adapt_shading(
