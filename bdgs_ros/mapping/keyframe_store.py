@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.errors import MapError
 from bdgs_ros.core.types import DepthImage, Pose
+from bdgs_ros.mapping.depth_bend import DepthBend
 from bdgs_ros.mapping.history import History
 from bdgs_ros.mapping.keyframes import MapKeyframe, build_levels
 from bdgs_ros.mapping.vignette import Vignette
@@ -52,6 +53,8 @@ class KeyframeSet:
     """Of all that ever were."""
     vignette: Vignette = field(default_factory=Vignette)
     """Of the camera, as far as it was found out."""
+    depth_bend: DepthBend = field(default_factory=DepthBend)
+    """Of the depth sensor; the depth of the keyframes is without it."""
     next_index: int = 0
 
 
@@ -87,6 +90,7 @@ def write_keyframes(folder: Path, kept: KeyframeSet, gaussians: int) -> None:
             'next_index': kept.next_index,
             'history': kept.history.to_document(),
             'vignette': list(kept.vignette.coefficients),
+            'depth_bend': list(kept.depth_bend.coefficients),
         },
         'frames': frames,
     }
@@ -166,9 +170,12 @@ def read_keyframes(folder: Path, levels: int) -> KeyframeSet:
     own = document['bdgs']
     try:
         vignette = Vignette(*map(float, own['vignette']))
+        depth_bend = DepthBend(own.get('depth_bend', ()))
         entries = document['frames']
         keyframes = [_read_frame(folder, entry, levels, vignette) for entry in entries]
         history = History.from_document(own['history'])
+        for keyframe in keyframes:
+            keyframe.depth_bend = depth_bend.coefficients
         next_index = int(own['next_index'])
     except (KeyError, TypeError, ValueError) as error:
         raise MapError(
@@ -176,7 +183,7 @@ def read_keyframes(folder: Path, levels: int) -> KeyframeSet:
             f"remove '{folder}' to use the map without its keyframes"
         ) from error
     newest = max((keyframe.index for keyframe in keyframes), default=-1)
-    return KeyframeSet(keyframes, history, vignette, max(next_index, newest + 1))
+    return KeyframeSet(keyframes, history, vignette, depth_bend, max(next_index, newest + 1))
 
 
 def _read_document(folder: Path) -> dict[str, Any]:

@@ -84,6 +84,8 @@ class MapKeyframe:
     """Finest first."""
     exposure: Array = field(default_factory=lambda: np.zeros(2, np.float32))
     """(log gain, offset): the camera's image is exp(gain) * render + offset."""
+    depth_bend: tuple[float, ...] = ()
+    """What the depth of `levels` was corrected by; see `bdgs_ros.mapping.depth_bend`."""
     exposure_moments: list[Array] = field(
         default_factory=lambda: [np.zeros(2, np.float32), np.zeros(2, np.float32)]
     )

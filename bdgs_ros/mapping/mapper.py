@@ -25,6 +25,7 @@ from bdgs_ros.core.types import (
     Trajectory,
 )
 from bdgs_ros.mapping import growth, prune
+from bdgs_ros.mapping.depth_bend import DepthBend, RangeImage
 from bdgs_ros.mapping.exposure import fit_exposure
 from bdgs_ros.mapping.gaussians import GaussianMap
 from bdgs_ros.mapping.history import History
@@ -68,7 +69,9 @@ class Mapper:
         self.keyframes: list[MapKeyframe] = []
         self.history = History()
         self.vignette = Vignette()
+        self.depth_bend = DepthBend()
         self._photos: list[Photo] = []
+        self._ranges: list[RangeImage] = []
         self._count = 0
         self._rng = np.random.default_rng(self._config.seed)
 
@@ -92,6 +95,7 @@ class Mapper:
         fine = shrink(keyframe, self._config.width)
         if self.frozen:
             return self.view(fine.frame.stamp_ns, fine.T_world_camera, fine.frame.camera)
+        fine = self._straighten(fine)
         small = shrink(fine, self._config.growth_width)
         agree = self._infer(small)
         static = self._look(small, agree)
@@ -100,12 +104,25 @@ class Mapper:
         current = self._remember(fine, level.static)
         self._calibrate(current, level, static)
         self._insert(current, level, static, in_front & ~is_dynamic(small.p_dynamic))
-        self._optimiser.run(self.map, current, self._companions())
+        companions = self._companions()
+        for companion in companions:
+            self.depth_bend.renew(companion)
+        self._optimiser.run(self.map, current, companions)
         self._thin()
         self.history.publish(current)
         return self.view(
             current.stamp_ns, current.T_world_camera, fine.frame.camera, current.exposure
         )
+
+    def _straighten(self, keyframe: Keyframe) -> Keyframe:
+        """Learn the bend of the depth sensor, and take out of the depth what is known of it."""
+        frame = keyframe.frame
+        measured = RangeImage.of(shrink(keyframe, self._config.growth_width))
+        for earlier in self._ranges:
+            self.depth_bend.learn(measured, earlier)
+        self._ranges = [*self._ranges, measured][-_PHOTOS:]
+        depth_m = self.depth_bend.correct(frame.depth_m, frame.camera)
+        return replace(keyframe, frame=replace(frame, depth_m=depth_m))
 
     def render(self, T_world_camera: Pose, camera: PinholeCamera) -> Rendered:
         """Render the static map: what Eq. 11 lets through."""
@@ -208,6 +225,7 @@ class Mapper:
         current = MapKeyframe(
             self._count, frame.stamp_ns, keyframe.T_world_camera, keyframe.p_dynamic, levels
         )
+        current.depth_bend = self.depth_bend.coefficients
         if self.keyframes:
             current.exposure = self.keyframes[-1].exposure.copy()
         self.keyframes.append(current)
@@ -293,7 +311,7 @@ class Mapper:
 
     def as_photograph(self, rendered: Rendered, camera: PinholeCamera, stamp_ns: int) -> Rendered:
         """
-        Return a render as the camera would show it at a time: exposed, and with falloff.
+        Return a render as the camera would show it at a time: exposed, with falloff, depth bent.
 
         The exposure is blended between the keyframes around that time.
         """
@@ -304,7 +322,12 @@ class Mapper:
         self, rendered: Rendered, camera: PinholeCamera, exposure: NDArray[np.float32]
     ) -> Rendered:
         color = np.exp(exposure[0]) * rendered.color + exposure[1] * rendered.silhouette[..., None]
-        return replace(rendered, color=color * self.vignette.falloff(camera)[..., None])
+        color = color * self.vignette.falloff(camera)[..., None]
+        silhouette = np.maximum(rendered.silhouette, np.float32(1e-6))
+        surface = np.asarray(rendered.depth / silhouette, np.float32)
+        return replace(
+            rendered, color=color, depth=silhouette * self.depth_bend.bend(surface, camera)
+        )
 
     def final_trajectory(self, online: Trajectory) -> Trajectory:
         """Return poses with what mapping found out after it had answered tracking."""
@@ -356,7 +379,11 @@ class Mapper:
 
         """
         self.history.refresh(self.keyframes)
-        kept = KeyframeSet(self.keyframes, self.history, self.vignette, self._count)
+        for keyframe in self.keyframes:
+            self.depth_bend.renew(keyframe)
+        kept = KeyframeSet(
+            self.keyframes, self.history, self.vignette, self.depth_bend, self._count
+        )
         save_map(Path(path), self.map, kept if keyframes else None)
 
     def load(self, path: Path) -> None:
@@ -376,6 +403,7 @@ class Mapper:
         self.map = loaded
         self.keyframes = list(kept.keyframes)
         self.history, self.vignette = kept.history, kept.vignette
+        self.depth_bend = kept.depth_bend
         self._count = kept.next_index
 
 
