@@ -40,7 +40,7 @@ _TOLERANCE = 3.0  # noises beyond which differences count less
 _SAME_SURFACE = 0.03  # 1/m
 _EDGE = 0.03  # of the depth: larger steps between neighbours are edges
 _INDEPENDENT = 100.0  # pixels of a pair that err each for itself
-_MIN_PIXELS = 300
+_MIN_PIXELS, _MAX_PIXELS = 200, 1500
 _PRIOR_SIGMA = 0.01  # of a coefficient, 1/m: what sensors are like
 _KNOWN_SIGMA = 0.004  # of one that an earlier run found
 _MIN_SLANT = 0.2  # of a surface: nothing is learned from those seen under a smaller sine
@@ -65,6 +65,7 @@ class DepthBend:
             raise ValueError(f'coefficients: expected {FUNCTIONS} numbers, received {start}')
         self.coefficients: tuple[float, ...] = tuple(start.tolist())
         """c_k, 1/m."""
+        self._start = start
         sigma = _KNOWN_SIGMA if start.any() else _PRIOR_SIGMA
         self._information = np.eye(FUNCTIONS) / sigma**2
         self._evidence = self._information @ start
@@ -97,8 +98,11 @@ class DepthBend:
         information, evidence = found
         self._information += information
         self._evidence += evidence
-        solved = np.linalg.solve(self._information, self._evidence)
-        self.coefficients = tuple(solved.tolist())
+        covariance = np.linalg.inv(self._information)
+        change = covariance @ self._evidence - self._start
+        doubt = np.diag(covariance) / np.maximum(change**2, 1e-12)
+        # What is within its own uncertainty is not applied (shrinkage of James and Stein).
+        self.coefficients = tuple((self._start + np.maximum(1 - doubt, 0) * change).tolist())
 
 
 def shift(depth_m: DepthImage, change: Array) -> DepthImage:
@@ -214,8 +218,10 @@ def _shared(
     one: RangeImage, other: RangeImage, T_other_one: Pose, c: Matrix
 ) -> tuple[Matrix, Matrix, NDArray[np.int64]]:
     """Return rays and corrected inverse depth of `one`, and in which pixels (u, v) of `other`."""
-    rays = one.camera.rays()[one.usable].astype(np.float64)
-    r = one.inverse[one.usable] + _functions(rays[:, 0], rays[:, 1]) @ c
+    chosen = np.flatnonzero(one.usable)
+    chosen = chosen[:: 1 + len(chosen) // _MAX_PIXELS]
+    rays = one.camera.rays().reshape(-1, 3)[chosen].astype(np.float64)
+    r = one.inverse.ravel()[chosen] + _functions(rays[:, 0], rays[:, 1]) @ c
     moved = rays @ T_other_one[:3, :3].T + r[:, None] * T_other_one[:3, 3]
     seen = (r > _LEAST_INVERSE) & (moved[:, 2] > _LEAST_M)
     rays, r, moved = rays[seen], r[seen], moved[seen]

@@ -91,7 +91,7 @@ def test_a_bend_is_recovered_with_wrong_poses() -> None:
 def test_where_there_is_no_bend_none_is_found() -> None:
     rng = np.random.default_rng(0)
     found = learned([image(measured(room_depth(T), none(), rng), T) for T in poses(9)])
-    assert worst_cm(found.coefficients, none()) < 1.0
+    assert worst_cm(found.coefficients, none()) < 0.3
 
 
 def test_a_camera_that_stands_still_teaches_nothing() -> None:
@@ -111,8 +111,8 @@ def test_a_wrong_scale_of_the_depth_is_no_bend() -> None:
     assert worst_cm(learned(views).coefficients, none()) < 1.0
 
 
-@pytest.mark.parametrize('named', [True, False])
-def test_something_that_moves_does_not_matter(named: bool) -> None:
+@pytest.mark.parametrize(('named', 'limit_cm'), [(True, 2.5), (False, 3.5)])
+def test_something_that_moves_hardly_matters(named: bool, limit_cm: float) -> None:
     rng = np.random.default_rng(0)
     views = []
     for i, T in enumerate(poses(9)):
@@ -121,7 +121,7 @@ def test_something_that_moves_does_not_matter(named: bool) -> None:
         mover[20:, 15 * i : 15 * i + 35] = True
         depth[mover] = 1.0
         views.append(image(depth, T, np.where(mover & named, 250, 0).astype(np.uint8)))
-    assert worst_cm(learned(views).coefficients, BENT) < 2.5
+    assert worst_cm(learned(views).coefficients, BENT) < limit_cm
 
 
 @pytest.mark.parametrize('invalid', [0.0, np.nan])
