@@ -47,12 +47,17 @@ class Level:
     depth_m: DepthImage  # [H, W]
     static: NDArray[np.bool_]  # [H, W] False where something moves
     vignette: Vignette = field(default_factory=Vignette)
+    part: tuple[PinholeCamera, Window] | None = None
+    """Of which image this is a part, if any: what holds for all windows is computed once."""
 
     @property
     def color(self) -> Array:
         """RGB without the lens's falloff, nominally in [0, 1], [H, W, 3]."""
-        falloff = self.vignette.falloff(self.camera)
-        return np.asarray(self.image * (np.float32(1 / 255) / falloff)[..., None], np.float32)
+        if self.part is None:
+            return np.asarray(self.image * self.vignette.scale(self.camera), np.float32)
+        whole, window = self.part
+        scale = self.vignette.scale(whole)[window.rows, window.columns]
+        return np.asarray(self.image * scale, np.float32)
 
     @property
     def weight(self) -> Array:
@@ -69,7 +74,8 @@ class Level:
             cx=self.camera.cx - window.columns.start,
             cy=self.camera.cy - window.rows.start,
         )
-        return Level(camera, self.image[at], self.depth_m[at], self.static[at], self.vignette)
+        images = self.image[at], self.depth_m[at], self.static[at]
+        return Level(camera, *images, self.vignette, (self.camera, window))
 
 
 @dataclass(eq=False)
