@@ -79,14 +79,19 @@ class Optimiser:
         penalised = visible & (gaussians.states == State.DYNAMIC)
         coarse, fine = self._plan(newest, others)
 
-        def steps(plan: Plan) -> list[float]:
-            return [self._step(gaussians, kf, level, visible, penalised) for kf, level in plan]
+        def steps(plan: Plan, done: int) -> list[float]:
+            # poses settle: Adam's steps do not get smaller by themselves
+            calm = [(1 - (done + i) / self._config.iterations) ** 2 for i in range(len(plan))]
+            return [
+                self._step(gaussians, kf, level, visible, penalised, pose_scale=scale)
+                for (kf, level), scale in zip(plan, calm, strict=True)
+            ]
 
-        losses = steps(coarse)
+        losses = steps(coarse, 0)
         seen = [loss for (kf, level), loss in zip(coarse, losses, strict=True) if kf is newest]
         if _gain(seen[len(seen) // 2 :]) < self._config.enough:
             fine = fine[: self._config.min_fine]
-        return losses + steps(fine)
+        return losses + steps(fine, len(coarse))
 
     def step(
         self,
@@ -112,7 +117,9 @@ class Optimiser:
         """
         visible = gaussians.visible_mask()
         penalised = visible & (gaussians.states == State.DYNAMIC)
-        return self._step(gaussians, keyframe, level_index, visible, penalised, rate_scale)
+        return self._step(
+            gaussians, keyframe, level_index, visible, penalised, rate_scale, rate_scale**2
+        )
 
     def _plan(self, newest: MapKeyframe, others: Sequence[MapKeyframe]) -> tuple[Plan, Plan]:
         """Return keyframe and pyramid level of each iteration: coarse ones, finest ones."""
@@ -139,6 +146,7 @@ class Optimiser:
         visible: NDArray[np.bool_],
         penalised: NDArray[np.bool_],
         rate_scale: float = 1.0,
+        pose_scale: float = 1.0,
     ) -> float:
         level = self._look(keyframe.levels[level_index])
         active = visible & self._opaque_enough(gaussians.logit_opacities, level_index)
@@ -152,7 +160,7 @@ class Optimiser:
             seen = result.visibility > 0
             self._adapt_shading(gaussians, shading, gradients['colors'], seen, rate_scale)
         self._adapt_exposure(keyframe, result.exposure_gradient, rate_scale)
-        self._adapt_pose(keyframe, result.gradients.pose, rate_scale)
+        self._adapt_pose(keyframe, result.gradients.pose, pose_scale)
         return result.loss + regulariser
 
     def _look(self, level: Level) -> Level:
@@ -264,13 +272,13 @@ class Optimiser:
         adam_step(keyframe.exposure, gradient, *moments, rate=rate)
 
     def _adapt_pose(
-        self, keyframe: MapKeyframe, gradient: NDArray[np.float64], rate_scale: float
+        self, keyframe: MapKeyframe, gradient: NDArray[np.float64], scale: float
     ) -> None:
         """Let a keyframe's pose follow the map; the first keyframe defines the world."""
         if keyframe.index == 0:
             return
         xi = np.zeros(6, np.float32)
-        rate = rate_scale * self._config.rate.pose
+        rate = scale * self._config.rate.pose
         first, second = keyframe.pose_moments
         adam_step(xi, gradient.astype(np.float32), first, second, rate=rate, betas=_POSE_BETAS)
         keyframe.move(xi)

@@ -25,7 +25,7 @@ class Refiner:
     gaussians : GaussianMap
         Changed in place.
     keyframes : sequence of MapKeyframe
-        Their exposures are adapted too.
+        Their exposures and poses are adapted too, but for those of the oldest.
     config : MappingConfig
         Of the run; `seed` chooses the order of the keyframes.
 
@@ -62,10 +62,11 @@ class Refiner:
 
         """
         keyframe = self._next_keyframe()
-        exposure = keyframe.exposure.copy()
+        exposure, pose = keyframe.exposure.copy(), keyframe.T_world_camera
         loss = self._optimiser.step(self._map, keyframe, _FINEST, rate_scale(progress))
-        if keyframe is self._anchor:  # else colours and exposures could drift together
+        if keyframe is self._anchor:  # else all could drift together
             keyframe.exposure[:] = exposure
+            keyframe.T_world_camera = pose
         return loss
 
     def _next_keyframe(self) -> MapKeyframe:

@@ -152,10 +152,10 @@ class MappingConfig:
     )
     iterations: int = param(40, 'optimisation steps per keyframe', low=0, high=1000)
     enough: float = param(
-        0.1, 'with less gain at the last coarse level only min_fine iterations follow', high=1.0
+        0.15, 'with less gain at the last coarse level only min_fine iterations follow', high=1.0
     )
     min_fine: int = param(
-        8, 'iterations at the finest level where the residual says enough', low=0, high=1000
+        16, 'iterations at the finest level where the residual says enough', low=0, high=1000
     )
     window: int = param(8, 'newest keyframes in every optimisation', low=1, high=64)
     keyframes: int = param(
