@@ -10,12 +10,12 @@ from sensor_msgs.msg import Image
 
 from bdgs_ros.bridge import conversions, topics
 from bdgs_ros.bridge.health import Health
-from bdgs_ros.bridge.model_view import ModelImages, ModelSubscription, decode_model
+from bdgs_ros.bridge.model_view import ModelMessages, ModelSubscription, decode_model
 from bdgs_ros.bridge.node_config import TrackingNodeConfig
 from bdgs_ros.bridge.stamped import StampBuffer
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.errors import DatasetError
-from bdgs_ros.core.types import Labels, ModelView, Pose, RgbdFrame, TrackingResult
+from bdgs_ros.core.types import Labels, ModelView, RgbdFrame, TrackingResult
 from bdgs_ros.data.trajectory_io import seconds_to_ns
 
 Item = TypeVar('Item')
@@ -50,9 +50,9 @@ class Feedback:
         self._config = config
         self._health = health
         self._labels: StampBuffer[Image] = StampBuffer(_LABELS_KEPT)
-        self._models: StampBuffer[tuple[int, ModelImages]] = StampBuffer(_MODELS_KEPT)
+        self._models: StampBuffer[tuple[int, ModelMessages]] = StampBuffer(_MODELS_KEPT)
         self._heard: set[str] = set()
-        self._keyframes: OrderedDict[int, tuple[Pose, PinholeCamera]] = OrderedDict()
+        self._keyframes: OrderedDict[int, PinholeCamera] = OrderedDict()
         node.create_subscription(
             Image,
             topics.LABELS,
@@ -60,7 +60,7 @@ class Feedback:
             topics.KEPT,
         )
         self._subscription = ModelSubscription(
-            node, lambda stamp_ns, images: self._models.put(stamp_ns, (stamp_ns, images))
+            node, lambda stamp_ns, found: self._models.put(stamp_ns, (stamp_ns, found))
         )
 
     def labels(self, frame: RgbdFrame) -> Labels | None:
@@ -106,12 +106,12 @@ class Feedback:
         return item
 
     def note_keyframe(self, result: TrackingResult, camera: PinholeCamera) -> None:
-        """Remember a keyframe's pose: its model view comes back with its stamp only."""
+        """Remember a keyframe's camera: its model view comes back without."""
         if not result.is_keyframe:
             return
         mapped = self._node.count_publishers(topics.MODEL_IMAGE) > 0
         self._health.mark('mapping', '' if mapped else 'no mapping: frame to keyframe only')
-        self._keyframes[result.stamp_ns] = (result.T_world_camera, camera)
+        self._keyframes[result.stamp_ns] = camera
         while len(self._keyframes) > _KEYFRAMES_KEPT:
             self._keyframes.popitem(last=False)
 
@@ -127,12 +127,12 @@ class Feedback:
         view = None if found is None else self._decode(*found)
         return [] if view is None else [view]
 
-    def _decode(self, stamp_ns: int, images: ModelImages) -> ModelView | None:
+    def _decode(self, stamp_ns: int, messages: ModelMessages) -> ModelView | None:
         if stamp_ns not in self._keyframes:  # from before a reset or a restart
             self._health.counts['models_of_unknown_keyframes'] += 1
             return None
         try:
-            return decode_model(stamp_ns, images, *self._keyframes[stamp_ns])
+            return decode_model(stamp_ns, messages, self._keyframes[stamp_ns])
         except (DatasetError, ValueError) as error:
             self._health.warn(str(error))
             return None

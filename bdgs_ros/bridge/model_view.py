@@ -1,71 +1,79 @@
-"""The feedback from mapping to tracking: a `ModelView` as three images of one stamp."""
+"""The feedback from mapping to tracking: a `ModelView` as three images and a pose of one stamp."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
+from geometry_msgs.msg import PoseStamped
 from rclpy.node import Node
 from sensor_msgs.msg import Image
 
 from bdgs_ros.bridge import conversions, topics
 from bdgs_ros.bridge.stamped import Assembler
 from bdgs_ros.core.camera import PinholeCamera
-from bdgs_ros.core.types import ModelView, Pose
+from bdgs_ros.core.types import ModelView
 
-_TOPICS = (topics.MODEL_IMAGE, topics.MODEL_DEPTH, topics.MODEL_DYNAMIC)
+_IMAGES = (topics.MODEL_IMAGE, topics.MODEL_DEPTH, topics.MODEL_DYNAMIC)
+_TYPES: dict[str, Any] = {**dict.fromkeys(_IMAGES, Image), topics.MODEL_POSE: PoseStamped}
 
-ModelImages = dict[str, Image]
+ModelMessages = dict[str, Any]
+"""By topic: three Image and a PoseStamped."""
 
 
 class ModelPublisher:
     """Publish model views; an empty image says that a keyframe has none."""
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, map_frame: str) -> None:
+        self._map_frame = map_frame
         self._publishers = {
-            topic: node.create_publisher(Image, topic, topics.RELIABLE) for topic in _TOPICS
+            topic: node.create_publisher(kind, topic, topics.RELIABLE)
+            for topic, kind in _TYPES.items()
         }
 
     def publish(self, stamp_ns: int, view: ModelView | None) -> None:
         """Answer the keyframe of a stamp."""
         head = conversions.header(stamp_ns, '')
         if view is None:
-            images = dict.fromkeys(_TOPICS, Image(header=head))
+            messages = {topic: kind(header=head) for topic, kind in _TYPES.items()}
         else:
-            images = {
+            pose = conversions.pose_stamped(view.T_world_camera, stamp_ns, self._map_frame)
+            messages = {
                 topics.MODEL_IMAGE: conversions.color_to_message(view.color, head),
                 topics.MODEL_DEPTH: conversions.depth_to_message(view.depth_m, head),
                 topics.MODEL_DYNAMIC: conversions.probability_to_message(view.p_dynamic, head),
+                topics.MODEL_POSE: pose,
             }
-        for topic, image in images.items():
-            self._publishers[topic].publish(image)
+        for topic, message in messages.items():
+            self._publishers[topic].publish(message)
 
 
 class ModelSubscription:
     """
-    Collect the three images of each stamp.
+    Collect the messages of each stamp.
 
     Parameters
     ----------
     node : Node
         It subscribes.
     on_model : callable
-        Called with the stamp and the images, in the executor's thread.
+        Called with the stamp and the messages, in the executor's thread.
 
     """
 
-    def __init__(self, node: Node, on_model: Callable[[int, ModelImages], None]) -> None:
+    def __init__(self, node: Node, on_model: Callable[[int, ModelMessages], None]) -> None:
         self._on_model = on_model
-        self._assembler: Assembler[Image] = Assembler(_TOPICS)
-        for topic in _TOPICS:
+        self._assembler: Assembler[Any] = Assembler(tuple(_TYPES))
+        for topic, kind in _TYPES.items():
             node.create_subscription(
-                Image,
+                kind,
                 topic,
-                lambda message, topic=topic: self._on_image(topic, message),
+                lambda message, topic=topic: self._on_message(topic, message),
                 topics.RELIABLE,
             )
 
-    def _on_image(self, topic: str, message: Image) -> None:
+    def _on_message(self, topic: str, message: Any) -> None:
         stamp_ns = conversions.stamp_ns(message)
         complete = self._assembler.add(stamp_ns, topic, message)
         if complete is not None:
@@ -73,19 +81,17 @@ class ModelSubscription:
 
 
 def decode_model(
-    stamp_ns: int, images: ModelImages, T_world_camera: Pose, camera: PinholeCamera
+    stamp_ns: int, messages: ModelMessages, camera: PinholeCamera
 ) -> ModelView | None:
     """
-    Turn the three images into a view, None if they are empty.
+    Turn the messages into a view, None if they are empty.
 
     Parameters
     ----------
     stamp_ns : int
         Of the keyframe.
-    images : dict of str to Image
+    messages : dict
         By topic.
-    T_world_camera : ndarray, shape (4, 4)
-        Pose of the keyframe.
     camera : PinholeCamera
         Of the full image; the view is that image scaled.
 
@@ -95,7 +101,7 @@ def decode_model(
         If an image has another encoding than mapping publishes.
 
     """
-    image = images[topics.MODEL_IMAGE]
+    image = messages[topics.MODEL_IMAGE]
     if not image.width:
         return None
     scaled = camera
@@ -103,11 +109,11 @@ def decode_model(
         scaled = camera.scaled(image.width / camera.width)
     return ModelView(
         stamp_ns,
-        T_world_camera,
+        conversions.pose_from_message(messages[topics.MODEL_POSE].pose),
         scaled,
         conversions.color_from_message(image, topics.MODEL_IMAGE),
-        conversions.depth_from_message(images[topics.MODEL_DEPTH], topics.MODEL_DEPTH).astype(
+        conversions.depth_from_message(messages[topics.MODEL_DEPTH], topics.MODEL_DEPTH).astype(
             np.float32, copy=False
         ),
-        conversions.probability_from_message(images[topics.MODEL_DYNAMIC], topics.MODEL_DYNAMIC),
+        conversions.probability_from_message(messages[topics.MODEL_DYNAMIC], topics.MODEL_DYNAMIC),
     )

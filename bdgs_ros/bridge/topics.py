@@ -21,6 +21,8 @@ KEYFRAME = 'bdgs/keyframe'
 MODEL_IMAGE = 'bdgs/model/image'
 MODEL_DEPTH = 'bdgs/model/depth'
 MODEL_DYNAMIC = 'bdgs/model/dynamic'
+MODEL_POSE = 'bdgs/model/pose'
+"""Where mapping now knows the keyframe to be that the model images show."""
 RENDERED_IMAGE = 'bdgs/rendered/image'
 RENDERED_DEPTH = 'bdgs/rendered/depth'
 DYNAMIC_PROBABILITY = 'bdgs/dynamic_probability'

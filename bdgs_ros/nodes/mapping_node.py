@@ -53,7 +53,7 @@ class MappingNode(GraphNode):
         self._frames: StampBuffer[RawFrame] = StampBuffer(config.frame_buffer)
         self._labels: StampBuffer[Image] = StampBuffer(_LABELS_KEPT)
         self._decoder = FrameDecoder.of(self)
-        self._models = ModelPublisher(self)
+        self._models = ModelPublisher(self, self._config.map_frame)
         self._output = MapOutput(self, config)
         self._viewpoint: Viewpoint | None = None
         self._pose: PoseStamped | None = None

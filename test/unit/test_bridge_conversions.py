@@ -172,14 +172,17 @@ def test_model_view_round_trip(rng: np.random.Generator) -> None:
     color = rng.integers(0, 256, (2, 3, 3), dtype=np.uint8)
     depth = rng.uniform(0, 5, (2, 3)).astype(np.float32)
     p_dynamic = rng.integers(0, 256, (2, 3), dtype=np.uint8)
+    pose = se3.exp(np.array([0.1, 0.2, -0.3, 0.3, 0.2, 0.1]))
     images = {
         topics.MODEL_IMAGE: conversions.color_to_message(color, HEAD),
         topics.MODEL_DEPTH: conversions.depth_to_message(depth, HEAD),
         topics.MODEL_DYNAMIC: conversions.probability_to_message(p_dynamic, HEAD),
+        topics.MODEL_POSE: conversions.pose_stamped(pose, 7, 'map'),
     }
     camera = PinholeCamera(6, 4, 5.0, 5.0, 2.5, 1.5)
-    view = decode_model(7, images, np.eye(4), camera)
+    view = decode_model(7, images, camera)
     assert view is not None
+    np.testing.assert_allclose(view.T_world_camera, pose, atol=1e-12)
     assert view.camera == camera.scaled(0.5)
     assert np.array_equal(view.color, color)
     assert np.array_equal(view.depth_m, depth)
@@ -191,7 +194,7 @@ def test_an_empty_model_image_means_no_model() -> None:
         (topics.MODEL_IMAGE, topics.MODEL_DEPTH, topics.MODEL_DYNAMIC), Image(header=HEAD)
     )
     camera = PinholeCamera(6, 4, 5.0, 5.0, 2.5, 1.5)
-    assert decode_model(7, images, np.eye(4), camera) is None
+    assert decode_model(7, images, camera) is None
 
 
 class TinyMap:
