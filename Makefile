@@ -28,6 +28,7 @@ check: install
 bench: install
 	$(BIN)/bdgs bench slam
 	$(BIN)/bdgs bench rasterizer
+	$(BIN)/bdgs bench mapping
 
 cuda-check: install
 	BDGS_REQUIRE_CUDA=1 $(BIN)/python3 -m pytest test/unit/test_rasterize_gsplat.py \
