@@ -51,7 +51,7 @@ class Renderer(Protocol):
         """Show the static map from a pose."""
 
     def as_photograph(self, rendered: Any, camera: PinholeCamera, stamp_ns: int) -> Render:
-        """Return a render as the camera would show it then: its exposure, its lens's falloff."""
+        """Return a render as the camera would show it then, with the errors that it has."""
 
     def final_pose(self, stamp_ns: int, T_world_camera: Pose) -> Pose:
         """Return a pose with what mapping found out after tracking gave it."""
@@ -80,7 +80,9 @@ class View:
     photo: NDArray[np.float32]
     """As the camera would show it, by the exposure of the keyframes around."""
     depth_m: NDArray[np.float32]
-    """Expected depth; 0 where the map is empty."""
+    """Expected depth as the map has it; 0 where the map is empty."""
+    photo_depth_m: NDArray[np.float32]
+    """The same as the depth sensor would measure it."""
     silhouette: NDArray[np.float32]
 
 
@@ -90,9 +92,20 @@ def render_view(sample: Sample, renderer: Renderer) -> View:
     pose = renderer.final_pose(frame.stamp_ns, sample.T_world_camera)
     render = renderer.render(pose, frame.camera)
     photo = renderer.as_photograph(render, frame.camera, frame.stamp_ns)
+    return View(
+        sample,
+        render.color,
+        photo.color,
+        _surface_depth(render),
+        _surface_depth(photo),
+        render.silhouette,
+    )
+
+
+def _surface_depth(render: Render) -> NDArray[np.float32]:
     seen = render.silhouette > _SEEN
     depth_m = np.where(seen, render.depth / np.maximum(render.silhouette, _SEEN), 0.0)
-    return View(sample, render.color, photo.color, depth_m.astype(np.float32), render.silhouette)
+    return np.asarray(depth_m, np.float32)
 
 
 def render_samples(samples: Sequence[Sample], renderer: Renderer) -> list[View]:
@@ -181,7 +194,8 @@ def score_view(
         return _against_truth(view, truth, perceptual)
     counted = view.sample.static if static is None else static
     frame: RgbdFrame = view.sample.frame
-    scores = _scores(view, view.photo, (frame.color, frame.depth_m), counted, perceptual)
+    shown = view.photo, view.photo_depth_m
+    scores = _scores(view, shown, (frame.color, frame.depth_m), counted, perceptual)
     return {**scores, 'psnr_map': rendering.psnr(view.color, frame.color, counted)}
 
 
@@ -215,18 +229,19 @@ def _against_truth(view: View, truth: Truth, perceptual: Perceptual | None) -> d
     hidden = np.asarray(truth.dynamic(stamp_ns), dtype=bool)
     wanted = truth.static_color(stamp_ns), truth.static_depth(stamp_ns)
     everything = np.ones(hidden.shape, dtype=bool)
-    scores = _scores(view, view.color, wanted, everything, perceptual)
+    shown = view.color, view.depth_m
+    scores = _scores(view, shown, wanted, everything, perceptual)
     return {**scores, 'psnr_hidden': rendering.psnr(view.color, wanted[0], hidden)}
 
 
 def _scores(
     view: View,
-    shown: NDArray[np.float32],
+    images: tuple[NDArray[np.float32], NDArray[np.float32]],
     wanted: tuple[ColorImage, DepthImage],
     valid: NDArray[np.bool_],
     perceptual: Perceptual | None,
 ) -> dict[str, float]:
-    color, depth = wanted
+    (shown, shown_depth_m), (color, depth) = images, wanted
     fitted = rendering.fit_exposure(shown, color, valid)
     seen = view.silhouette > _SEEN
     scores = {
@@ -234,7 +249,7 @@ def _scores(
         'psnr_exposure_fit': rendering.psnr(fitted, color, valid),
         'psnr_seen': rendering.psnr(shown, color, valid & seen),
         'ssim': rendering.ssim(shown, color, valid),
-        'depth_l1': 100.0 * rendering.depth_l1(view.depth_m, depth, valid),
+        'depth_l1': 100.0 * rendering.depth_l1(shown_depth_m, depth, valid),
         'seen': 100.0 * float(np.mean(seen)),
     }
     if perceptual is not None:
