@@ -195,8 +195,8 @@ class Mapper:
         return static
 
     def _in_map_colors(self, frame: RgbdFrame) -> NDArray[np.float32]:
-        """Return an image without falloff and, as far as is known yet, exposure, [H, W, 3]."""
-        log_gain, offset = self.history.exposure(frame.stamp_ns)
+        """Return an image without falloff and exposure, that of the last keyframe, [H, W, 3]."""
+        log_gain, offset = self.keyframes[-1].exposure if self.keyframes else (0.0, 0.0)
         falloff = self.vignette.falloff(frame.camera)[..., None]
         color = frame.color.astype(np.float32) / (np.float32(255) * falloff)
         return np.asarray((color - offset) / np.exp(log_gain), np.float32)
