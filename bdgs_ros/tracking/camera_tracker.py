@@ -189,16 +189,7 @@ class CameraTracker:
             return self._lost(frame, guess, p_dynamic, quality)
         self._motion.update(frame.stamp_ns, estimate.T_world_camera, quality.covariance)
         self._become_keyframe(frame, estimate.T_world_camera, current)
-        return TrackingResult(
-            frame.stamp_ns,
-            TrackingStatus.OK,
-            estimate.T_world_camera,
-            quality.covariance,
-            True,
-            p_dynamic,
-            quality.inlier_ratio,
-            quality.overlap,
-        )
+        return _tracked(frame, estimate, True, p_dynamic, quality.overlap)
 
     def _align(
         self,
@@ -262,16 +253,7 @@ class CameraTracker:
         is_keyframe = self._needs_keyframe(estimate.T_world_camera, overlap)
         if is_keyframe:
             self._become_keyframe(frame, estimate.T_world_camera, current)
-        return TrackingResult(
-            frame.stamp_ns,
-            TrackingStatus.OK,
-            estimate.T_world_camera,
-            quality.covariance,
-            is_keyframe,
-            p_dynamic,
-            quality.inlier_ratio,
-            overlap,
-        )
+        return _tracked(frame, estimate, is_keyframe, p_dynamic, overlap)
 
     def _lost(
         self,
@@ -326,6 +308,25 @@ class CameraTracker:
             del self._tracked[min(self._tracked)]
         self._keyframe_depth_m = _median_depth(frame.depth_m)
         self._frames_since_keyframe = 0
+
+
+def _tracked(
+    frame: RgbdFrame,
+    estimate: Estimate,
+    is_keyframe: bool,
+    p_dynamic: ProbabilityImage,
+    overlap: float,
+) -> TrackingResult:
+    return TrackingResult(
+        frame.stamp_ns,
+        TrackingStatus.OK,
+        estimate.T_world_camera,
+        estimate.quality.covariance,
+        is_keyframe,
+        p_dynamic,
+        estimate.quality.inlier_ratio,
+        overlap,
+    )
 
 
 def _median_depth(depth_m: NDArray[np.float32]) -> float:

@@ -16,7 +16,7 @@ class LossConfig:
     reg: float = param(1.0, 'lambda_reg of Eq. 7 on the squared norm of Sigma', low=0.0)
     ssim: float = param(0.2, 'gamma of Eq. 9', low=0.0, high=1.0)
     smooth: float = param(
-        0.0, 'lambda of the first term of Eq. 8, edge-aware', unit='1/m', low=0.0
+        0.01, 'lambda of the first term of Eq. 8, edge-aware', unit='1/m', low=0.0
     )
     depth: float = param(0.3, 'weight of the depth term', unit='1/m', low=0.0)
     empty: float = param(
