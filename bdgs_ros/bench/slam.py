@@ -28,6 +28,7 @@ _COLUMNS = {
     'frames': 'frames_in',
     'coverage_percent': 'coverage',
     'ate_rmse_cm': 'ate_rmse',
+    'ate_final_cm': 'ate_final_rmse',
     'ate_max_cm': 'ate_max',
     'precision': 'dynamic_precision',
     'recall': 'dynamic_recall',
