@@ -28,7 +28,7 @@ class ModelPublisher:
     def __init__(self, node: Node, map_frame: str) -> None:
         self._map_frame = map_frame
         self._publishers = {
-            topic: node.create_publisher(kind, topic, topics.RELIABLE)
+            topic: node.create_publisher(kind, topic, topics.MODELS)
             for topic, kind in _TYPES.items()
         }
 
@@ -70,7 +70,7 @@ class ModelSubscription:
                 kind,
                 topic,
                 lambda message, topic=topic: self._on_message(topic, message),
-                topics.RELIABLE,
+                topics.MODELS,
             )
 
     def _on_message(self, topic: str, message: Any) -> None:

@@ -51,6 +51,12 @@ KEPT = QoSProfile(
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
 """Labels: those published before a subscriber was discovered still reach it."""
+MODELS = QoSProfile(
+    depth=4,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+"""Model views, likewise; they are large, so fewer are kept. One part missing spoils a view."""
 LATCHED = QoSProfile(
     depth=1,
     reliability=ReliabilityPolicy.RELIABLE,
