@@ -157,6 +157,21 @@ class GaussianMap:
         self.checks = _join(self.checks, none)
         self.confirmations = _join(self.confirmations, none)
 
+    def copy(self, rows: NDArray[np.int64]) -> None:
+        """Add a copy of some Gaussians at the end, with optimiser state of its own."""
+        for name in PARAMETERS:
+            block = self.parameters[name][rows]
+            self.parameters[name] = _join(self.parameters[name], block)
+            self.moments[name] = [_join(m, np.zeros_like(block)) for m in self.moments[name]]
+        smoothed = np.concatenate([self.belief.smoothed, self.belief.smoothed[rows]])
+        self.belief.append(self.belief.belief[rows])
+        self.belief.smoothed = smoothed
+        self.keyframe_index = _join(self.keyframe_index, self.keyframe_index[rows])
+        self.observations = _join(self.observations, self.observations[rows])
+        self.contribution = _join(self.contribution, self.contribution[rows])
+        self.checks = _join(self.checks, self.checks[rows])
+        self.confirmations = _join(self.confirmations, self.confirmations[rows])
+
     def keep(self, mask: NDArray[np.bool_]) -> None:
         """Drop the Gaussians where `mask`, shape (N,), is False."""
         if mask.all():

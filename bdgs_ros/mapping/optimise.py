@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from bdgs_ros.belief.fusion import State
 from bdgs_ros.core.config import MappingConfig
 from bdgs_ros.mapping import losses
+from bdgs_ros.mapping.densify import PositionalGradient
 from bdgs_ros.mapping.gaussians import RASTERISED, GaussianMap
 from bdgs_ros.mapping.harmonics import Shading
 from bdgs_ros.mapping.keyframes import Level, MapKeyframe, Window
@@ -43,6 +44,8 @@ class Optimiser:
             empty=config.loss.empty,
         )
         self._rng = np.random.default_rng(config.seed)
+        self.pull: PositionalGradient | None = None
+        """Where set, the positional gradients of all steps are gathered in it."""
         self._scratch = np.empty((0, 0), np.float32)  # kept: fresh memory is slow
         rate = config.rate
         self._rates = {
@@ -154,6 +157,9 @@ class Optimiser:
         shaded = gaussians.as_gaussians(shading, active)
         result = self._photometric(shaded, keyframe, level, active)
         gradients = dict(zip(RASTERISED, result.gradients.parameters(), strict=True))
+        if self.pull is not None:
+            seen, pose = result.visibility > 0, keyframe.T_camera_world
+            self.pull.note(gaussians.means, gradients['means'], seen, pose, level.camera)
         regulariser = self._add_direct_terms(gaussians, gradients, level, penalised)
         self._adam(gaussians, gradients, (result.visibility > 0) | penalised, rate_scale)
         if shading is not None:

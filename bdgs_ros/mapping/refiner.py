@@ -8,6 +8,7 @@ import numpy as np
 
 from bdgs_ros.core.config import MappingConfig
 from bdgs_ros.core.errors import MapError
+from bdgs_ros.mapping.densify import PositionalGradient, divide
 from bdgs_ros.mapping.gaussians import GaussianMap
 from bdgs_ros.mapping.keyframes import MapKeyframe
 from bdgs_ros.mapping.optimise import Optimiser
@@ -46,9 +47,12 @@ class Refiner:
             )
         self._map = gaussians
         self._keyframes = keyframes
+        self._config = config
         self._optimiser = Optimiser(config)
         self._rng = np.random.default_rng(config.seed)
         self._waiting: list[int] = []
+        self._densified = 0
+        self._gather()
         self._anchor = min(keyframes, key=lambda keyframe: keyframe.index)
 
     def step(self, progress: float) -> float:
@@ -61,6 +65,7 @@ class Refiner:
             Share of the refinement that is done, 0 to 1; learning rates fall with it.
 
         """
+        self._densify(progress)
         keyframe = self._next_keyframe()
         exposure, pose = keyframe.exposure.copy(), keyframe.T_world_camera
         loss = self._optimiser.step(self._map, keyframe, _FINEST, rate_scale(progress))
@@ -68,6 +73,24 @@ class Refiner:
             keyframe.exposure[:] = exposure
             keyframe.T_world_camera = pose
         return loss
+
+    def _densify(self, progress: float) -> None:
+        """Divide the Gaussians that are pulled most, at even intervals of the first half."""
+        rounds = self._config.densify.rounds
+        if self._densified >= rounds or progress < 0.5 * (self._densified + 1) / rounds:
+            return
+        self._densified += 1
+        room = self._config.prune.max_gaussians - len(self._map)
+        wanted = round(self._config.densify.share * len(self._map))
+        pull = self._optimiser.pull
+        if pull is not None and room > 0:
+            divide(self._map, pull.strongest(min(wanted, room)))
+        self._gather()
+
+    def _gather(self) -> None:
+        """Gather gradients for the next round, if there is one."""
+        more = self._densified < self._config.densify.rounds
+        self._optimiser.pull = PositionalGradient(len(self._map)) if more else None
 
     def _next_keyframe(self) -> MapKeyframe:
         """Return keyframes in random order, each once before any comes again."""

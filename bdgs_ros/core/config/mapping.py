@@ -112,6 +112,14 @@ class MergeConfig:
 
 
 @dataclass(frozen=True)
+class DensifyConfig:
+    """Division of Gaussians by gradient, in refinement."""
+
+    rounds: int = param(5, 'times in the first half of a refinement; 0: never', low=0, high=100)
+    share: float = param(0.1, 'of the Gaussians divided each time', low=0.0, high=1.0)
+
+
+@dataclass(frozen=True)
 class PyramidConfig:
     """Coarse to fine, Eq. 12 and 13."""
 
@@ -169,6 +177,7 @@ class MappingConfig:
     loss: LossConfig = field(default_factory=LossConfig)
     rate: LearningRateConfig = field(default_factory=LearningRateConfig)
     insert: InsertConfig = field(default_factory=InsertConfig)
+    densify: DensifyConfig = field(default_factory=DensifyConfig)
     prune: PruneConfig = field(default_factory=PruneConfig)
     merge: MergeConfig = field(default_factory=MergeConfig)
     pyramid: PyramidConfig = field(default_factory=PyramidConfig)
