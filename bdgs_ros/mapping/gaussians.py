@@ -23,6 +23,7 @@ Scalar = TypeVar('Scalar', np.float32, np.int32)
 
 RASTERISED = ('means', 'quats', 'log_scales', 'logit_opacities', 'colors')
 PARAMETERS = (*RASTERISED, 'harmonics')
+_RECORDS = ('keyframe_index', 'observations', 'contribution', 'checks', 'confirmations')
 
 
 @dataclass(frozen=True)
@@ -166,11 +167,9 @@ class GaussianMap:
         smoothed = np.concatenate([self.belief.smoothed, self.belief.smoothed[rows]])
         self.belief.append(self.belief.belief[rows])
         self.belief.smoothed = smoothed
-        self.keyframe_index = _join(self.keyframe_index, self.keyframe_index[rows])
-        self.observations = _join(self.observations, self.observations[rows])
-        self.contribution = _join(self.contribution, self.contribution[rows])
-        self.checks = _join(self.checks, self.checks[rows])
-        self.confirmations = _join(self.confirmations, self.confirmations[rows])
+        for name in _RECORDS:
+            record = getattr(self, name)
+            setattr(self, name, _join(record, record[rows]))
 
     def keep(self, mask: NDArray[np.bool_]) -> None:
         """Drop the Gaussians where `mask`, shape (N,), is False."""
@@ -180,11 +179,8 @@ class GaussianMap:
             self.parameters[name] = np.ascontiguousarray(self.parameters[name][mask])
             self.moments[name] = [np.ascontiguousarray(m[mask]) for m in self.moments[name]]
         self.belief.keep(mask)
-        self.keyframe_index = self.keyframe_index[mask]
-        self.observations = self.observations[mask]
-        self.contribution = self.contribution[mask]
-        self.checks = self.checks[mask]
-        self.confirmations = self.confirmations[mask]
+        for name in _RECORDS:
+            setattr(self, name, getattr(self, name)[mask])
 
     def pool(self, groups: Groups, parameters: dict[str, Array]) -> None:
         """

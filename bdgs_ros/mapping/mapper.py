@@ -197,8 +197,7 @@ class Mapper:
     def _in_map_colors(self, frame: RgbdFrame) -> NDArray[np.float32]:
         """Return an image without falloff and exposure, that of the last keyframe, [H, W, 3]."""
         log_gain, offset = self.keyframes[-1].exposure if self.keyframes else (0.0, 0.0)
-        falloff = self.vignette.falloff(frame.camera)[..., None]
-        color = frame.color.astype(np.float32) / (np.float32(255) * falloff)
+        color = frame.color * self.vignette.scale(frame.camera)
         return np.asarray((color - offset) / np.exp(log_gain), np.float32)
 
     def _in_front(self, keyframe: Keyframe, static: Rendered) -> Mask:
