@@ -19,11 +19,13 @@ from bdgs_ros.mapping.rasterize import Gaussians
 from bdgs_ros.mapping.rotations import multiply, quats_from_axes
 
 Array = NDArray[np.float32]
-Scalar = TypeVar('Scalar', np.float32, np.int32)
+Scalar = TypeVar('Scalar', np.float32, np.int32, np.int64)
 
 RASTERISED = ('means', 'quats', 'log_scales', 'logit_opacities', 'colors')
 PARAMETERS = (*RASTERISED, 'harmonics')
-_RECORDS = ('keyframe_index', 'observations', 'contribution', 'checks', 'confirmations')
+_RECORDS = (
+    'keyframe_index', 'observations', 'contribution', 'checks', 'confirmations', 'serial',
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,9 @@ class GaussianMap:
     `parameters` holds the optimised arrays by their names in `PARAMETERS`; `moments` the first
     and second Adam moments of the same shapes; `keyframe_index` the keyframe that brought each
     Gaussian, [N] int32; `observations` how often it was seen, [N] int32. `contribution`, `checks`
-    and `confirmations` are what pruning remembers (`bdgs_ros.mapping.prune`), not saved.
+    and `confirmations` are what pruning remembers (`bdgs_ros.mapping.prune`), not saved. `serial`,
+    [N] int64, is a number that no other Gaussian of this map ever has or had, from 0 in order of
+    birth, by which it can be followed while others come and go; not saved.
     """
 
     def __init__(self, config: BeliefConfig, degree: int = 0) -> None:
@@ -64,6 +68,8 @@ class GaussianMap:
         self.contribution = np.zeros(0, np.float32)
         self.checks = np.zeros(0, np.int32)
         self.confirmations = np.zeros(0, np.int32)
+        self.serial = np.zeros(0, np.int64)
+        self._born = 0
 
     def __len__(self) -> int:
         """Return the number of Gaussians."""
@@ -157,6 +163,11 @@ class GaussianMap:
         self.contribution = _join(self.contribution, np.ones(count, np.float32))
         self.checks = _join(self.checks, none)
         self.confirmations = _join(self.confirmations, none)
+        self.serial = _join(self.serial, self._new_serials(count))
+
+    def _new_serials(self, count: int) -> NDArray[np.int64]:
+        self._born += count
+        return np.arange(self._born - count, self._born, dtype=np.int64)
 
     def copy(self, rows: NDArray[np.int64]) -> None:
         """Add a copy of some Gaussians at the end, with optimiser state of its own."""
@@ -170,6 +181,7 @@ class GaussianMap:
         for name in _RECORDS:
             record = getattr(self, name)
             setattr(self, name, _join(record, record[rows]))
+        self.serial[len(self) - len(rows) :] = self._new_serials(len(rows))
 
     def keep(self, mask: NDArray[np.bool_]) -> None:
         """Drop the Gaussians where `mask`, shape (N,), is False."""
@@ -203,6 +215,7 @@ class GaussianMap:
         self.contribution = groups.most(self.contribution)
         self.checks = groups.most(self.checks)
         self.confirmations = groups.most(self.confirmations)
+        self.serial = self.serial[groups.leader]
 
     def deform(self, transforms: Mapping[int, Pose]) -> None:
         """
