@@ -66,6 +66,11 @@ class DirectEgoMotion:
         self._misses = 0
         self._step = se3.identity()  # T_last_current of the last pair of frames
 
+    @property
+    def predicted(self) -> Pose:
+        """`T_odom_camera` of the next frame at constant velocity."""
+        return self._T_odom_camera @ self._step
+
     def update(self, frame: RgbdFrame, p_dynamic: ProbabilityImage) -> Pose | None:
         """
         Return `T_odom_camera` of the next frame, or None when it cannot be aligned.
@@ -82,7 +87,7 @@ class DirectEgoMotion:
         if self._anchor is None:
             self._anchor = _Anchor(frame.stamp_ns, self._T_odom_camera, current)
             return self._T_odom_camera
-        guess = self._T_odom_camera @ self._step
+        guess = self.predicted
         result = self._aligner.align(
             self._anchor.pyramid, current, se3.inverse(guess) @ self._anchor.T_odom_camera
         )
