@@ -173,8 +173,12 @@ class DetectionStage:
     def _place(self, stamp_ns: int, expected: Pose, T_odom_camera: Pose | None) -> None:
         """Correct the place of the frame, now that the ego-motion is known."""
         if T_odom_camera is None:  # the odometry begins anew, where the camera is
-            self.tracks.move(se3.inverse(expected))
-            self._asked.clear()
+            T_new_old = se3.inverse(expected)
+            self.tracks.move(T_new_old)
+            self._asked = {
+                s: replace(asked, T_odom_camera=T_new_old @ asked.T_odom_camera)
+                for s, asked in self._asked.items()
+            }
         elif stamp_ns in self._asked:
             asked = self._asked[stamp_ns]
             self._asked[stamp_ns] = replace(asked, T_odom_camera=T_odom_camera)

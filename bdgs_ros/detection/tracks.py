@@ -31,7 +31,6 @@ Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 
 _MEASURED = np.eye(5, 8)  # the measurement matrix H: position and size
-_BORN = 0.35  # a score that is as likely for a false detection as for a true one
 _VISIBLE = 0.15  # less of a box inside the image, and the object has left
 _SECONDS = 1e-9
 
@@ -75,14 +74,17 @@ class Track:
 
 def transition(dt: float, config: TracksConfig) -> tuple[Matrix, Matrix]:
     """
-    Return F and Q over a time: velocities and sizes drift like Brownian motion.
+    Return F and Q over a time.
+
+    Velocities are an Ornstein-Uhlenbeck process (Singer's model one derivative lower): those of
+    people are bounded and forgotten within a second. Sizes drift like Brownian motion.
 
     Parameters
     ----------
     dt : float
         Seconds, not negative.
     config : TracksConfig
-        How much drifts in one second.
+        `speed` is the standard deviation of the velocity, `speed_s` its correlation time.
 
     Returns
     -------
@@ -92,11 +94,15 @@ def transition(dt: float, config: TracksConfig) -> tuple[Matrix, Matrix]:
     """
     F, Q = np.eye(8), np.zeros((8, 8))
     position, size, velocity = np.arange(3), np.arange(3, 5), np.arange(5, 8)
-    F[position, velocity] = dt
-    density = config.speed_change**2
-    Q[position, position] = density * dt**3 / 3
-    Q[position, velocity] = Q[velocity, position] = density * dt**2 / 2
-    Q[velocity, velocity] = density * dt
+    tau, variance = config.speed_s, config.speed**2
+    kept = np.exp(-dt / tau)
+    F[position, velocity] = tau * (1 - kept)
+    F[velocity, velocity] = kept
+    # The integrals over the time that is left of the noise that enters meanwhile.
+    spread = 2 * tau * dt - tau**2 * (3 - 4 * kept + kept**2)
+    Q[position, position] = variance * max(spread, 0.0)
+    Q[position, velocity] = Q[velocity, position] = variance * tau * (1 - kept) ** 2
+    Q[velocity, velocity] = variance * (1 - kept**2)
     Q[size, size] = config.size_change**2 * dt
     return F, Q
 
@@ -211,7 +217,7 @@ class ObjectTracks:
     def _corrected(self, track: Track, sighting: Sighting, T_odom_camera: Pose) -> Track:
         z, R = sighting.measurement(T_odom_camera, self._config)
         state, covariance = kalman_update(track.state, track.covariance, z, R, _MEASURED)
-        odds = min(track.odds * _evidence(sighting.detection.score), self._config.most_odds)
+        odds = min(track.odds * self._evidence(sighting.detection.score), self._config.most_odds)
         return replace(
             track,
             seen_ns=track.stamp_ns,
@@ -223,10 +229,10 @@ class ObjectTracks:
 
     def _born(self, stamp_ns: int, sighting: Sighting, T_odom_camera: Pose) -> Track | None:
         z, R = sighting.measurement(T_odom_camera, self._config)
-        covariance = np.diag([0.0] * 5 + [self._config.start_speed**2] * 3)
+        covariance = np.diag([0.0] * 5 + [self._config.speed**2] * 3)
         covariance[:5, :5] = R
         state = np.concatenate([z, np.zeros(3)])
-        odds = self._odds_of_birth(sighting) * _evidence(sighting.detection.score)
+        odds = self._odds_of_birth(sighting) * self._evidence(sighting.detection.score)
         self._count += 1
         return Track(
             self._count, stamp_ns, stamp_ns, state, covariance, odds, sighting.detection
@@ -250,8 +256,7 @@ class ObjectTracks:
         inside = shown is not None and shown.visible >= _VISIBLE
         return inside and unseen_s <= self._config.longest_s and track.odds > 0.02
 
-
-def _evidence(score: float) -> float:
-    """Return the factor by which a detection of a score raises the odds; never lowers them."""
-    odds = score / max(1.0 - score, 1e-3)
-    return max(odds * (1.0 - _BORN) / _BORN, 1.0)
+    def _evidence(self, score: float) -> float:
+        """Return the factor by which a detection of a score raises the odds; never lowers them."""
+        even = self._config.even_score
+        return max(score / max(1.0 - score, 1e-3) * (1.0 - even) / even, 1.0)

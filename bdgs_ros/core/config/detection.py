@@ -41,6 +41,9 @@ class TracksConfig:
     birth_odds: float = param(
         0.1, 'that a new detection elsewhere is a real one', low=0.0, high=100.0
     )
+    even_score: float = param(
+        0.2, 'the score that a false detection has as often as a true one', low=0.01, high=0.99
+    )
     most_odds: float = param(
         200.0, 'that an object exists, however often it was seen', low=1.0, high=1e6
     )
@@ -51,11 +54,11 @@ class TracksConfig:
     longest_s: float = param(
         1.0, 'an object not seen for longer is let go', unit='s', low=0.0, high=60.0
     )
-    start_speed: float = param(
-        1.0, 'standard deviation of a new object', unit='m/s', low=0.01, high=100.0
+    speed: float = param(
+        0.8, 'of an object, standard deviation per axis', unit='m/s', low=0.01, high=100.0
     )
-    speed_change: float = param(
-        1.5, 'of a velocity within one second', unit='m/s', low=0.01, high=100.0
+    speed_s: float = param(
+        1.0, 'for which an object keeps its velocity', unit='s', low=0.01, high=100.0
     )
     size_change: float = param(0.4, 'of a size within one second', unit='m', low=0.01, high=10.0)
     box_sigma: float = param(
