@@ -12,7 +12,7 @@ from scipy.optimize import linear_sum_assignment
 from bdgs_ros.core.config.detection import TracksConfig
 from bdgs_ros.core.types import Detection, Pose
 from bdgs_ros.detection.postprocess import iou_matrix
-from bdgs_ros.detection.sighting import Shown, Sighting
+from bdgs_ros.detection.sighting import Shown, Sighting, measurement
 
 Matrix = NDArray[np.float64]
 
@@ -72,9 +72,7 @@ def assign(
     cost = _costs(tracks, expected, sightings, T_odom_camera, config)
     rows, columns = linear_sum_assignment(cost)
     return [
-        (int(i), int(k))
-        for i, k in zip(rows, columns, strict=True)
-        if cost[i, k] < _FORBIDDEN
+        (int(i), int(k)) for i, k in zip(rows, columns, strict=True) if cost[i, k] < _FORBIDDEN
     ]
 
 
@@ -108,9 +106,9 @@ def _overlaps(expected: Sequence[Shown | None], sightings: Sequence[Sighting]) -
 def _distances(
     sighting: Sighting, tracks: Sequence[Predicted], T_odom_camera: Pose, config: TracksConfig
 ) -> Matrix:
-    """Mahalanobis distance of a sighting from each object's predicted position, shape (M,)."""
-    z, R = sighting.measurement(T_odom_camera, config)
-    innovation = z[:3] - np.array([t.state[:3] for t in tracks])
-    S = np.array([t.covariance[:3, :3] for t in tracks]) + R[:3, :3]
+    """Mahalanobis distance of a sighting from each object's prediction, shape (M,)."""
+    m = measurement(sighting, T_odom_camera, config)
+    innovation = m.z - np.array([t.state for t in tracks]) @ m.H.T
+    S = m.H @ np.array([t.covariance for t in tracks]) @ m.H.T + m.R
     solved = np.linalg.solve(S, innovation[..., None])[..., 0]
     return np.asarray(np.sqrt(np.einsum('mi,mi->m', innovation, solved)))

@@ -101,9 +101,7 @@ def object_depths(
     ]
 
 
-def _object_depth(
-    depth_m: DepthImage, bins: Bins, box: Box, config: CutConfig
-) -> float | None:
+def _object_depth(depth_m: DepthImage, bins: Bins, box: Box, config: CutConfig) -> float | None:
     inside = depth_m[box[1] : box[3], box[0] : box[2]]
     known = inside[(cut_box(bins, box, config) > 0) & (inside > 0)]
     return float(np.median(known)) if known.size else None

@@ -17,7 +17,7 @@ Vector = NDArray[np.float64]
 
 _NOMINAL_M, _NOMINAL_SIGMA_M = 0.5, 0.3  # nearer than a structured-light camera sees
 _BORDER_PX = 3.0
-_CUT_OFF = 5.0  # times the noise, of a box that the image border cuts
+_HIDDEN_SIGMA_M = 0.5  # where an edge is that lies beyond the border of the image
 
 
 @dataclass(frozen=True)
@@ -25,30 +25,58 @@ class Sighting:
     """One detection with its place in the camera's frame."""
 
     detection: Detection
-    centre: Vector
-    """Of the box, at the object's depth, metres, shape (3,)."""
-    size_m: tuple[float, float]
-    """Width and height."""
+    edges_m: Vector
+    """Left, top, right and bottom of the box at the object's depth, metres, shape (4,)."""
+    depth_m: float
     has_depth: bool
-    cut_off: tuple[bool, bool]
-    """Whether the border of the image cuts it: left or right; above or below."""
+    """Whether the depth is measured."""
+    cut_off: tuple[bool, bool, bool, bool]
+    """Which edges are those of the image, with the object's own beyond: left, top, right, bottom."""
 
-    def measurement(self, T_odom_camera: Pose, config: TracksConfig) -> tuple[Vector, Vector]:
-        """
-        Return (x y z w h) in the odometry frame and its covariance, shapes (5,) and (5, 5).
 
-        The noise of a box grows with its size. Where the image cuts it, neither its centre nor
-        its size is what is seen.
-        """
-        scale = [_CUT_OFF if cut else 1.0 for cut in self.cut_off]
-        sigma_w, sigma_h = (config.box_sigma * s * k for s, k in zip(self.size_m, scale, strict=True))
-        sigma_z = config.depth_sigma if self.has_depth else _NOMINAL_SIGMA_M
-        rotation = T_odom_camera[:3, :3]
-        R = np.zeros((5, 5))
-        R[:3, :3] = rotation @ np.diag([sigma_w**2, sigma_h**2, sigma_z**2]) @ rotation.T
-        R[3, 3], R[4, 4] = 2 * sigma_w**2, 2 * sigma_h**2
-        position = rotation @ self.centre + T_odom_camera[:3, 3]
-        return np.array([*position, *self.size_m]), R
+@dataclass(frozen=True)
+class Measurement:
+    """
+    What a sighting says about the state of an object: z = H state + noise.
+
+    z is (left, top, right, bottom, depth) in metres in the axes of the camera, relative to the
+    odometry frame's origin.
+    """
+
+    z: Vector
+    """Shape (5,)."""
+    H: Vector
+    """Shape (5, 8)."""
+    R: Vector
+    """Shape (5, 5)."""
+
+
+def measurement(sighting: Sighting, T_odom_camera: Pose, config: TracksConfig) -> Measurement:
+    """
+    Return the measurement that a sighting is.
+
+    The noise of an edge grows with the size of the box, unless the border of the image cuts it:
+    then nearly nothing is known of it. An error of the depth moves the edges along their rays.
+    """
+    left, top, right, bottom = sighting.edges_m
+    sizes = np.array([right - left, bottom - top] * 2)
+    sigma = np.where(sighting.cut_off, _HIDDEN_SIGMA_M, config.box_sigma * sizes)
+    sigma_z = config.depth_sigma if sighting.has_depth else _NOMINAL_SIGMA_M
+    rays = np.append(sighting.edges_m / sighting.depth_m, 1.0)
+    R = np.diag(np.append(sigma**2, 0.0)) + sigma_z**2 * np.outer(rays, rays)
+    axes = T_odom_camera[:3, :3].T
+    H = np.zeros((5, 8))
+    H[[0, 2], :3], H[[1, 3], :3], H[4, :3] = axes[0], axes[1], axes[2]
+    H[[0, 2], 3] = H[[1, 3], 4] = (-0.5, 0.5)
+    x, y, depth = axes @ T_odom_camera[:3, 3]
+    z = np.append(sighting.edges_m, sighting.depth_m) + (x, y, x, y, depth)
+    return Measurement(z, H, R)
+
+
+def first_state(m: Measurement) -> tuple[Vector, Vector]:
+    """Return (x y z w h) that explains a measurement and its covariance, (5,) and (5, 5)."""
+    inverse = np.linalg.inv(m.H[:, :5])
+    return inverse @ m.z, inverse @ m.R @ inverse.T
 
 
 @dataclass(frozen=True)
@@ -87,21 +115,18 @@ def sightings(
     """
     movers = [d for d in detections if d.p_dynamic > 0]
     depths = object_depths(movers, depth_m, config)
-    return [_sighting(d, z, camera) for d, z in zip(movers, depths, strict=True)]
+    return [place(d, z, camera) for d, z in zip(movers, depths, strict=True)]
 
 
-def _sighting(detection: Detection, depth_m: float | None, camera: PinholeCamera) -> Sighting:
+def place(detection: Detection, depth_m: float | None, camera: PinholeCamera) -> Sighting:
+    """Return a detection with its place; where it has no depth it is nearer than sensors see."""
     z = _NOMINAL_M if depth_m is None else depth_m
     x0, y0, x1, y1 = detection.box_xyxy
-    u, v = (x0 + x1) / 2, (y0 + y1) / 2
-    centre = np.array([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z])
-    size_m = ((x1 - x0) * z / camera.fx, (y1 - y0) * z / camera.fy)
-    far = _BORDER_PX
-    cut_off = (
-        x0 < far or x1 > camera.width - far,
-        y0 < far or y1 > camera.height - far,
-    )
-    return Sighting(detection, centre, size_m, depth_m is not None, cut_off)
+    centre, focal = (camera.cx, camera.cy) * 2, (camera.fx, camera.fy) * 2
+    edges_m = (np.array(detection.box_xyxy) - centre) / focal * z
+    right, bottom = camera.width - _BORDER_PX, camera.height - _BORDER_PX
+    cut_off = (x0 < _BORDER_PX, y0 < _BORDER_PX, x1 > right, y1 > bottom)
+    return Sighting(detection, edges_m, z, depth_m is not None, cut_off)
 
 
 def shown_as(state: Vector, camera: PinholeCamera, T_odom_camera: Pose) -> Shown | None:
@@ -111,7 +136,9 @@ def shown_as(state: Vector, camera: PinholeCamera, T_odom_camera: Pose) -> Shown
         return None
     u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
     # A filter that is told of clipped boxes may shrink below nothing.
-    half_w, half_h = (0.5 * f * max(s, 0.05) / z for f, s in zip((camera.fx, camera.fy), state[3:5], strict=True))
+    half_w, half_h = (
+        0.5 * f * max(s, 0.05) / z for f, s in zip((camera.fx, camera.fy), state[3:5], strict=True)
+    )
     box = (u - half_w, v - half_h, u + half_w, v + half_h)
     limit = [camera.width, camera.height, camera.width, camera.height]
     a, b, c, d = np.clip(box, 0, limit).tolist()

@@ -73,9 +73,9 @@ class DetectionStage:
         runner: Callable[[Detector], LateDetector] = AtOnce,
     ) -> None:
         self._config = config
+        self.tracks = ObjectTracks(config.tracks)
         self._mute: NullDetector | None = None
         self._detector = self._open(detector, runner)
-        self.tracks = ObjectTracks(config.tracks)
         self._ego = DirectEgoMotion(config.warp)
         self._geometric = GeometricPrior(config.warp, self._ego) if config.geometric else None
         self._asked: dict[int, _Asked] = {}
@@ -203,6 +203,7 @@ class DetectionStage:
         _LOG.warning('detector failed, going on with the geometric prior alone: %s', error)
         self._mute = NullDetector(f'detector failed: {error}')
         self._detector = AtOnce(self._mute)
+        self.tracks.reset()
         return self._detector
 
 

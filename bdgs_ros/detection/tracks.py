@@ -25,12 +25,11 @@ from bdgs_ros.core.config.detection import TracksConfig
 from bdgs_ros.core.types import Detection, Pose
 from bdgs_ros.detection.association import assign
 from bdgs_ros.detection.classes import dynamic_prior
-from bdgs_ros.detection.sighting import Sighting, shown_as
+from bdgs_ros.detection.sighting import Sighting, first_state, measurement, shown_as
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 
-_MEASURED = np.eye(5, 8)  # the measurement matrix H: position and size
 _VISIBLE = 0.15  # less of a box inside the image, and the object has left
 _SECONDS = 1e-9
 
@@ -139,7 +138,11 @@ class ObjectTracks:
         )
 
     def update(
-        self, stamp_ns: int, sightings: Sequence[Sighting], camera: PinholeCamera, T_odom_camera: Pose
+        self,
+        stamp_ns: int,
+        sightings: Sequence[Sighting],
+        camera: PinholeCamera,
+        T_odom_camera: Pose,
     ) -> None:
         """
         Take in what the detector found in one image.
@@ -162,11 +165,13 @@ class ObjectTracks:
         followed = [self._corrected(tracks[k], sightings[i], T_odom_camera) for i, k in pairs]
         seen, taken = {i for i, _ in pairs}, {k for _, k in pairs}
         born = [
-            self._born(stamp_ns, s, T_odom_camera) for i, s in enumerate(sightings) if i not in seen
+            self._born(stamp_ns, s, T_odom_camera)
+            for i, s in enumerate(sightings)
+            if i not in seen
         ]
         missed = [self._missed(t) for k, t in enumerate(tracks) if k not in taken]
         held = [t for t in missed if self._worth_keeping(t, camera, T_odom_camera)]
-        self.tracks = tuple(followed + [b for b in born if b is not None] + held)
+        self.tracks = tuple(followed + born + held)
         self._stamp_ns = stamp_ns
 
     def at(self, stamp_ns: int, camera: PinholeCamera, T_odom_camera: Pose) -> list[Detection]:
@@ -195,9 +200,12 @@ class ObjectTracks:
         shown = shown_as(now.state, camera, T_odom_camera)
         if shown is None or shown.visible < _VISIBLE:
             return []
-        toward = T_odom_camera[:3, 2]
-        sigma_m = float(np.sqrt(toward @ now.covariance[:3, :3] @ toward))
-        reach = self._config.gate_sigma * np.hypot(sigma_m, self._config.depth_sigma)
+        axes = T_odom_camera[:3, :3]
+        sigma_m = np.sqrt(np.diag(axes.T @ now.covariance[:3, :3] @ axes))
+        wide = now.state.copy()
+        wide[3:5] += 2 * np.minimum(self._config.widen * sigma_m[:2], 0.5 * now.state[3:5])
+        shown = shown_as(wide, camera, T_odom_camera) or shown
+        reach = float(self._config.gate_sigma * np.hypot(sigma_m[2], self._config.depth_sigma))
         seen = replace(
             self._as_seen(track),
             box_xyxy=shown.clipped,
@@ -215,8 +223,8 @@ class ObjectTracks:
         return replace(track, state=state, covariance=covariance, stamp_ns=stamp_ns)
 
     def _corrected(self, track: Track, sighting: Sighting, T_odom_camera: Pose) -> Track:
-        z, R = sighting.measurement(T_odom_camera, self._config)
-        state, covariance = kalman_update(track.state, track.covariance, z, R, _MEASURED)
+        m = measurement(sighting, T_odom_camera, self._config)
+        state, covariance = kalman_update(track.state, track.covariance, m.z, m.R, m.H)
         odds = min(track.odds * self._evidence(sighting.detection.score), self._config.most_odds)
         return replace(
             track,
@@ -227,16 +235,14 @@ class ObjectTracks:
             detection=sighting.detection,
         )
 
-    def _born(self, stamp_ns: int, sighting: Sighting, T_odom_camera: Pose) -> Track | None:
-        z, R = sighting.measurement(T_odom_camera, self._config)
+    def _born(self, stamp_ns: int, sighting: Sighting, T_odom_camera: Pose) -> Track:
+        place, uncertainty = first_state(measurement(sighting, T_odom_camera, self._config))
         covariance = np.diag([0.0] * 5 + [self._config.speed**2] * 3)
-        covariance[:5, :5] = R
-        state = np.concatenate([z, np.zeros(3)])
+        covariance[:5, :5] = uncertainty
+        state = np.concatenate([place, np.zeros(3)])
         odds = self._odds_of_birth(sighting) * self._evidence(sighting.detection.score)
         self._count += 1
-        return Track(
-            self._count, stamp_ns, stamp_ns, state, covariance, odds, sighting.detection
-        )
+        return Track(self._count, stamp_ns, stamp_ns, state, covariance, odds, sighting.detection)
 
     def _odds_of_birth(self, sighting: Sighting) -> float:
         """Objects come in at the border, or were there at the start."""

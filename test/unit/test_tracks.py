@@ -11,7 +11,8 @@ from bdgs_ros.core import se3
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.config.detection import TracksConfig
 from bdgs_ros.core.types import Detection, Pose
-from bdgs_ros.detection.sighting import Sighting, shown_as
+from bdgs_ros.detection.classes import COCO_NAMES
+from bdgs_ros.detection.sighting import Sighting, place, shown_as
 from bdgs_ros.detection.tracks import ObjectTracks, transition
 
 CAMERA = PinholeCamera(640, 480, 525.0, 525.0, 319.5, 239.5)
@@ -29,9 +30,8 @@ def seen(
     """Return what a camera reports of an object of 0.5 x 1.6 m."""
     shown = shown_as(np.array([*position, 0.5, 1.6, 0, 0, 0]), CAMERA, T_odom_camera)
     assert shown is not None
-    centre = T_odom_camera[:3, :3].T @ (np.array(position) - T_odom_camera[:3, 3])
-    detection = Detection(shown.box, score, 0 if name == 'person' else 16, name, 0.9)
-    return Sighting(detection, centre, (0.5, 1.6), True, (False, False))
+    class_id = COCO_NAMES.index(name)
+    return place(Detection(shown.box, score, class_id, name, 0.9), shown.depth_m, CAMERA)
 
 
 def walker(k: int, speed: float = 1.0) -> tuple[float, float, float]:
@@ -133,7 +133,8 @@ def test_who_comes_in_at_the_border_is_believed() -> None:
     """More than who appears in the middle."""
     tracks = ObjectTracks(CONFIG)
     tracks.update(0, [], CAMERA, HOME)
-    entering = replace(seen((-1.7, 0.0, 3.0)), cut_off=(True, False))
+    entering = seen((-1.7, 0.0, 3.0))
+    assert entering.cut_off == (True, False, False, False)
     tracks.update(PERIOD_NS, [entering], CAMERA, HOME)
     assert tracks.at(PERIOD_NS, CAMERA, HOME)[0].p_dynamic > 0.5
 

@@ -48,31 +48,28 @@ class TracksConfig:
         200.0, 'that an object exists, however often it was seen', low=1.0, high=1e6
     )
     miss_s: float = param(
-        0.1, 'missed for so long, the odds of an object fall by e', unit='s', low=0.001, high=10.0
+        0.2, 'missed for so long, the odds of an object fall by e', unit='s', low=0.001, high=10.0
     )
-    miss_odds: float = param(0.3, 'the least factor of one miss', low=0.0, high=1.0)
+    miss_odds: float = param(0.5, 'the least factor of one miss', low=0.0, high=1.0)
     longest_s: float = param(
         1.0, 'an object not seen for longer is let go', unit='s', low=0.0, high=60.0
     )
     speed: float = param(
-        0.8, 'of an object, standard deviation per axis', unit='m/s', low=0.01, high=100.0
+        0.5, 'of an object, standard deviation per axis', unit='m/s', low=0.01, high=100.0
     )
     speed_s: float = param(
-        1.0, 'for which an object keeps its velocity', unit='s', low=0.01, high=100.0
+        0.5, 'for which an object keeps its velocity', unit='s', low=0.01, high=100.0
     )
     size_change: float = param(0.4, 'of a size within one second', unit='m', low=0.01, high=10.0)
-    box_sigma: float = param(
-        0.07, 'noise of a box, in parts of its size', low=0.001, high=1.0
-    )
-    depth_sigma: float = param(
-        0.12, "noise of an object's depth", unit='m', low=0.001, high=10.0
-    )
+    box_sigma: float = param(0.07, 'noise of a box, in parts of its size', low=0.001, high=1.0)
+    depth_sigma: float = param(0.12, "noise of an object's depth", unit='m', low=0.001, high=10.0)
     gate_sigma: float = param(
         4.0, 'further from its prediction an object is another one', unit='sigma', low=0.1
     )
-    gate_iou: float = param(
-        0.3, 'unless their boxes overlap by this', low=0.0, high=1.0
+    widen: float = param(
+        1.0, 'a predicted box is larger by this on each side', unit='sigma', low=0.0, high=10.0
     )
+    gate_iou: float = param(0.3, 'unless their boxes overlap by this', low=0.0, high=1.0)
 
 
 @dataclass(frozen=True)
