@@ -124,5 +124,5 @@ class InBackground:
 
     def _fail(self, error: Exception) -> None:
         with self._changed:
-            known = isinstance(error, ModelError)
-            self._error = error if known else ModelError(f'{type(error).__name__}: {error}')
+            text = f'{type(error).__name__}: {error}'
+            self._error = error if isinstance(error, ModelError) else ModelError(text)

@@ -31,7 +31,7 @@ class Sighting:
     has_depth: bool
     """Whether the depth is measured."""
     cut_off: tuple[bool, bool, bool, bool]
-    """Which edges are those of the image, with the object's own beyond: left, top, right, bottom."""
+    """Which edges are those of the image: left, top, right, bottom; the object goes on beyond."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def measurement(sighting: Sighting, T_odom_camera: Pose, config: TracksConfig) -
     H[[0, 2], :3], H[[1, 3], :3], H[4, :3] = axes[0], axes[1], axes[2]
     H[[0, 2], 3] = H[[1, 3], 4] = (-0.5, 0.5)
     x, y, depth = axes @ T_odom_camera[:3, 3]
-    z = np.append(sighting.edges_m, sighting.depth_m) + (x, y, x, y, depth)
+    z = np.append(sighting.edges_m, sighting.depth_m) + np.array([x, y, x, y, depth])
     return Measurement(z, H, R)
 
 

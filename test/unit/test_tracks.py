@@ -16,7 +16,7 @@ from bdgs_ros.detection.sighting import Sighting, place, shown_as
 from bdgs_ros.detection.tracks import ObjectTracks, transition
 
 CAMERA = PinholeCamera(640, 480, 525.0, 525.0, 319.5, 239.5)
-CONFIG = TracksConfig()
+CONFIG = TracksConfig(speed=1.0, speed_s=2.0)  # walkers who do not turn
 PERIOD_NS = 33_333_333
 HOME = se3.identity()
 
@@ -72,7 +72,7 @@ def test_velocity_comes_with_its_covariance() -> None:
     follow(tracks, range(60))
     (track,) = tracks.tracks
     error = track.velocity - [1.0, 0.0, 0.0]
-    assert np.linalg.norm(error) < 0.05
+    assert np.linalg.norm(error) < 0.1
     sigma = np.sqrt(np.diag(track.velocity_covariance))
     assert (np.abs(error) < 3 * sigma).all() and sigma[0] < 0.6
 

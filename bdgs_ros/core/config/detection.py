@@ -33,13 +33,13 @@ class TracksConfig:
 
     interval: int = param(1, 'run the network on every n-th frame', low=1, high=30)
     start_odds: float = param(
-        2.0, 'that a detection is a real one, in the first image', low=0.0, high=100.0
+        4.0, 'that a detection is a real one, in the first image', low=0.0, high=100.0
     )
     border_odds: float = param(
-        0.5, 'that a new detection at the border of the image is a real one', low=0.0, high=100.0
+        0.2, 'that a new detection at the border of the image is a real one', low=0.0, high=100.0
     )
     birth_odds: float = param(
-        0.1, 'that a new detection elsewhere is a real one', low=0.0, high=100.0
+        0.05, 'that a new detection elsewhere is a real one', low=0.0, high=100.0
     )
     even_score: float = param(
         0.2, 'the score that a false detection has as often as a true one', low=0.01, high=0.99
@@ -48,9 +48,9 @@ class TracksConfig:
         200.0, 'that an object exists, however often it was seen', low=1.0, high=1e6
     )
     miss_s: float = param(
-        0.2, 'missed for so long, the odds of an object fall by e', unit='s', low=0.001, high=10.0
+        0.1, 'missed for so long, the odds of an object fall by e', unit='s', low=0.001, high=10.0
     )
-    miss_odds: float = param(0.5, 'the least factor of one miss', low=0.0, high=1.0)
+    miss_odds: float = param(0.3, 'the least factor of one miss', low=0.0, high=1.0)
     longest_s: float = param(
         1.0, 'an object not seen for longer is let go', unit='s', low=0.0, high=60.0
     )
