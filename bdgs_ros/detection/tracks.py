@@ -159,7 +159,7 @@ class ObjectTracks:
             Where the camera was.
 
         """
-        tracks = [self._predicted(t, stamp_ns) for t in self.tracks]
+        tracks = self._predicted(stamp_ns)
         expected = [shown_as(t.state, camera, T_odom_camera) for t in tracks]
         pairs = assign(tracks, expected, sightings, T_odom_camera, self._config)
         followed = [self._corrected(tracks[k], sightings[i], T_odom_camera) for i, k in pairs]
@@ -182,11 +182,11 @@ class ObjectTracks:
         predicted one, wider by its uncertainty, and the depths between which they must be.
         """
         found = []
-        for track in self.tracks:
+        for track in self._predicted(stamp_ns):
             if track.seen_ns == stamp_ns:
                 found.append(self._as_seen(track))
             elif (stamp_ns - track.seen_ns) * _SECONDS <= self._config.longest_s:
-                found += self._as_predicted(track, stamp_ns, camera, T_odom_camera)
+                found += self._as_predicted(track, camera, T_odom_camera)
         return sorted(found, key=lambda d: -d.score)
 
     def _as_seen(self, track: Track) -> Detection:
@@ -194,9 +194,8 @@ class ObjectTracks:
         return replace(track.detection, p_dynamic=prior * track.p_exists)
 
     def _as_predicted(
-        self, track: Track, stamp_ns: int, camera: PinholeCamera, T_odom_camera: Pose
+        self, now: Track, camera: PinholeCamera, T_odom_camera: Pose
     ) -> list[Detection]:
-        now = self._predicted(track, stamp_ns)
         shown = shown_as(now.state, camera, T_odom_camera)
         if shown is None or shown.visible < _VISIBLE:
             return []
@@ -207,20 +206,24 @@ class ObjectTracks:
         shown = shown_as(wide, camera, T_odom_camera) or shown
         reach = float(self._config.gate_sigma * np.hypot(sigma_m[2], self._config.depth_sigma))
         seen = replace(
-            self._as_seen(track),
+            self._as_seen(now),
             box_xyxy=shown.clipped,
-            score=track.detection.score * track.p_exists,
+            score=now.detection.score * now.p_exists,
             depth_m=(shown.depth_m - reach, shown.depth_m + reach),
         )
         return [seen]
 
-    def _predicted(self, track: Track, stamp_ns: int) -> Track:
-        dt = (stamp_ns - track.stamp_ns) * _SECONDS
+    def _predicted(self, stamp_ns: int) -> list[Track]:
+        """Return the objects at a stamp; they all stand at that of the last answer."""
+        dt = 0.0 if self._stamp_ns is None else (stamp_ns - self._stamp_ns) * _SECONDS
         if dt <= 0:
-            return track
+            return list(self.tracks)
         F, Q = transition(dt, self._config)
-        state, covariance = kalman_predict(track.state, track.covariance, F, Q)
-        return replace(track, state=state, covariance=covariance, stamp_ns=stamp_ns)
+        moved = (kalman_predict(t.state, t.covariance, F, Q) for t in self.tracks)
+        return [
+            replace(t, state=state, covariance=covariance, stamp_ns=stamp_ns)
+            for t, (state, covariance) in zip(self.tracks, moved, strict=True)
+        ]
 
     def _corrected(self, track: Track, sighting: Sighting, T_odom_camera: Pose) -> Track:
         m = measurement(sighting, T_odom_camera, self._config)
