@@ -232,8 +232,8 @@ class BeliefLedger:
     def _judge(self, serial: Index, called: bool) -> None:
         books = self._books
         serial = serial[books.truth[serial] != TrueState.UNKNOWN]
-        dynamic = (books.truth[serial] == TrueState.DYNAMIC).astype(int)
-        np.add.at(self._judgements, (books.is_thing[serial].astype(int), dynamic, int(called)), 1)
+        kind = 2 * books.is_thing[serial] + (books.truth[serial] == TrueState.DYNAMIC)
+        self._judgements[:, :, int(called)] += np.bincount(kind, minlength=4).reshape(2, 2)
         books.judged[serial] = True
 
     def _compare_renders(self, stamp_ns: int, pose: Pose, camera: PinholeCamera) -> None:
