@@ -236,13 +236,14 @@ def _scores(score: BeliefScore, with_movers: bool) -> dict[str, Any]:
 def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return medians over scenarios and seeds of the full configuration, the worst, and cost."""
     full = [r for r in rows if r['configuration'] == _FULL and _is_synth(r)]
-    summary: dict[str, Any] = {
+    asked: dict[str, Any] = {
         'recall': _median(full, 'recall'),
         'precision': _median(full, 'precision'),
         'false_removal': _share(_median(full, 'false_removal_percent')),
         'restored': _share(_median(full, 'restored_percent')),
         'unknown_recall': _median(full, 'unknown_recall'),
     }
+    summary: dict[str, Any] = {}
     for column in (*_OVERVIEW[3:], 'inference_ms'):
         summary[f'{column}_median'] = _median(full, column)
     for column in _OVERVIEW:
@@ -257,7 +258,7 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         pooled_restored=pooled.restored_share,
         inference_50k_ms=_median(rows, 'inference_50k_ms'),
     )
-    return summary
+    return {**asked, **{name: value for name, value in summary.items() if value is not None}}
 
 
 def overviews(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[dict[str, Any]]]:

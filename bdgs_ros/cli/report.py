@@ -25,6 +25,7 @@ _MEANINGS = {
     'psnr': 'rendered static map against what is known to be true, PSNR',
     'psnr_exposure_fit': 'the same after a gain and offset per channel',
     'psnr_hidden': 'the same where something moving stood before it',
+    'psnr_rest': 'the same on the rest of these images',
     'ssim': 'SSIM',
     'depth_l1': 'depth error of the rendered map, mean',
     'dynamic_precision': 'pixels called dynamic that are',

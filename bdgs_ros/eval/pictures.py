@@ -17,7 +17,7 @@ from bdgs_ros.eval.posterior import PosteriorSample
 from bdgs_ros.eval.scores import View
 
 TITLES = ('input', 'dynamic probability', 'static map, rendered')
-POSTERIOR_TITLES = ('input', 'prior of its labels', 'posterior of the map', 'static map, rendered')
+POSTERIOR_TITLES = ('input', 'prior: labels', 'posterior of all Gaussians', 'static map, rendered')
 _OVERLAY = np.array([255.0, 60.0, 30.0])
 _HEADER_PX = 26
 _GAP_PX = 4
