@@ -9,8 +9,9 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from bdgs_ros.belief.filter import logit, render_mask
+from bdgs_ros.belief.filter import logit
 from bdgs_ros.belief.fusion import BeliefTracker, decide
+from bdgs_ros.belief.likelihood import Features
 from bdgs_ros.core.config import BeliefConfig
 from bdgs_ros.core.types import Pose
 from bdgs_ros.mapping.groups import Groups
@@ -24,8 +25,15 @@ Scalar = TypeVar('Scalar', np.float32, np.int32, np.int64)
 RASTERISED = ('means', 'quats', 'log_scales', 'logit_opacities', 'colors')
 PARAMETERS = (*RASTERISED, 'harmonics')
 _RECORDS = (
-    'keyframe_index', 'observations', 'contribution', 'checks', 'confirmations', 'serial',
-)  # fmt: skip
+    'keyframe_index',
+    'observations',
+    'contribution',
+    'checks',
+    'confirmations',
+    'streak',
+    'violations',
+    'serial',
+)
 
 
 @dataclass(frozen=True)
@@ -46,9 +54,10 @@ class GaussianMap:
     `parameters` holds the optimised arrays by their names in `PARAMETERS`; `moments` the first
     and second Adam moments of the same shapes; `keyframe_index` the keyframe that brought each
     Gaussian, [N] int32; `observations` how often it was seen, [N] int32. `contribution`, `checks`
-    and `confirmations` are what pruning remembers (`bdgs_ros.mapping.prune`), not saved. `serial`,
-    [N] int64, is a number that no other Gaussian of this map ever has or had, from 0 in order of
-    birth, by which it can be followed while others come and go; not saved.
+    and `confirmations` are what pruning remembers (`bdgs_ros.mapping.prune`), not saved, as are
+    `streak` and `violations`: keyframes in a row that measured a Gaussian where it is, or looked
+    through it. `serial`, [N] int64, is a number that no other Gaussian of this map ever has or
+    had, from 0 in order of birth, by which it can be followed while others come and go; not saved.
     """
 
     def __init__(self, config: BeliefConfig, degree: int = 0) -> None:
@@ -68,6 +77,8 @@ class GaussianMap:
         self.contribution = np.zeros(0, np.float32)
         self.checks = np.zeros(0, np.int32)
         self.confirmations = np.zeros(0, np.int32)
+        self.streak = np.zeros(0, np.int32)
+        self.violations = np.zeros(0, np.int32)
         self.serial = np.zeros(0, np.int64)
         self._born = 0
 
@@ -117,7 +128,7 @@ class GaussianMap:
 
     def visible_mask(self) -> NDArray[np.bool_]:
         """Return M_g of Eq. 11, [N]: True where a Gaussian is rendered."""
-        return render_mask(self.belief.smoothed, self._config.mask_threshold)
+        return ~self.belief.hidden
 
     def as_gaussians(
         self, shading: Shading | None = None, active: NDArray[np.bool_] | None = None
@@ -163,6 +174,8 @@ class GaussianMap:
         self.contribution = _join(self.contribution, np.ones(count, np.float32))
         self.checks = _join(self.checks, none)
         self.confirmations = _join(self.confirmations, none)
+        self.streak = _join(self.streak, none)
+        self.violations = _join(self.violations, none)
         self.serial = _join(self.serial, self._new_serials(count))
 
     def _new_serials(self, count: int) -> NDArray[np.int64]:
@@ -175,13 +188,18 @@ class GaussianMap:
             block = self.parameters[name][rows]
             self.parameters[name] = _join(self.parameters[name], block)
             self.moments[name] = [_join(m, np.zeros_like(block)) for m in self.moments[name]]
-        smoothed = np.concatenate([self.belief.smoothed, self.belief.smoothed[rows]])
-        self.belief.append(self.belief.belief[rows])
-        self.belief.smoothed = smoothed
+        self.belief.append(self.belief.belief[rows], self.belief.smoothed[rows])
         for name in _RECORDS:
             record = getattr(self, name)
             setattr(self, name, _join(record, record[rows]))
         self.serial[len(self) - len(rows) :] = self._new_serials(len(rows))
+
+    def note(self, features: Features) -> None:
+        """Count what a keyframe showed: who was seen, in place or through, and how often now."""
+        self.observations += features.visible
+        agrees, through = features.agrees, features.seen_through
+        self.streak = np.where(through, 0, self.streak + agrees).astype(np.int32)
+        self.violations = np.where(agrees, 0, self.violations + through).astype(np.int32)
 
     def keep(self, mask: NDArray[np.bool_]) -> None:
         """Drop the Gaussians where `mask`, shape (N,), is False."""
@@ -215,6 +233,8 @@ class GaussianMap:
         self.contribution = groups.most(self.contribution)
         self.checks = groups.most(self.checks)
         self.confirmations = groups.most(self.confirmations)
+        self.streak = groups.least(self.streak)
+        self.violations = groups.least(self.violations)
         self.serial = self.serial[groups.leader]
 
     def deform(self, transforms: Mapping[int, Pose]) -> None:
