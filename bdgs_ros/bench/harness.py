@@ -216,7 +216,7 @@ def _measured(run_cell: _RunCell, cell: Cell, options: Options, jobs: int = 1) -
     if jobs > 1:
         row = {name: value for name, value in row.items() if not name.endswith('_ms')}
         row['jobs'] = jobs
-    row = jsonable(row)
+    row = dict(jsonable(row))
     write_text(_cell_path(cell, options), dump_json(row) + '\n')
     return row
 

@@ -152,5 +152,5 @@ def test_cost_is_measured_with_the_memory_of_views_full(monkeypatch):
     monkeypatch.setattr(belief_cost, '_TIMED', 2)
     row = belief_cost.measure(BdgsConfig())
     assert row['cost_views'] == BdgsConfig().belief.views
-    assert 250 < row['cost_gaussians'] <= 500
+    assert row['cost_gaussians'] > 500  # the camera saw more of the room
     assert np.isfinite(row['inference_50k_ms'])

@@ -49,7 +49,9 @@ class BeliefConfig:
     mask_hysteresis: float = param(
         0.1, 'what was hidden is rendered again below the threshold by this', low=0.0, high=0.5
     )
-    max_log_odds: float = param(3.0, 'the most that is known before a keyframe', low=1.0, high=50.0)
+    max_log_odds: float = param(
+        3.0, 'the most that is known before a keyframe', low=1.0, high=50.0
+    )
     max_memory_log_odds: float = param(
         3.0, 'the most that earlier keyframes say of a new Gaussian', low=0.0, high=50.0
     )
