@@ -57,6 +57,9 @@ def run_job(
     """
     Run a recording and write its results.
 
+    Beside what `bdgs_ros.runner.write_results` writes there is `posterior.png`, what the map
+    believed at each second of the run.
+
     Parameters
     ----------
     job : Job

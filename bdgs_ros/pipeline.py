@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from bdgs_ros.core import se3
 from bdgs_ros.core.camera import PinholeCamera
@@ -29,8 +28,8 @@ class FrameResult:
 class BdgsSlam:
     """Bayesian dynamic Gaussian-splatting SLAM, section 3 of the paper."""
 
-    def __init__(self, config: BdgsConfig, detector: Any = None) -> None:
-        self.detection = DetectionStage(config.detection, detector)
+    def __init__(self, config: BdgsConfig) -> None:
+        self.detection = DetectionStage(config.detection)
         self.tracker = CameraTracker(config.tracking)
         self.mapper = Mapper(config.mapping, config.belief)
         self._map_width = config.mapping.width

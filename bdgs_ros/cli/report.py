@@ -101,6 +101,10 @@ def write_page(
         ),
         Picture(folder / 'trajectory.png', 'The path, and the error of every frame.'),
         Picture(folder / 'tiles.png', 'Some frames of the animation.'),
+        Picture(
+            folder / 'posterior.png',
+            'Each second of the run: input, prior, posterior of all Gaussians, static map then.',
+        ),
     ]
     title = title or f'bdgs_ros: {metrics["sequence"]}'
     facts = {**facts, **_origin(metrics['provenance'])}
