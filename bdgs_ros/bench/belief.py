@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bdgs_ros.bench import belief_cost, sequences
+from bdgs_ros.bench import belief_cost, belief_summary, sequences
+from bdgs_ros.bench.belief_summary import FULL, SCORED
 from bdgs_ros.bench.harness import Cell, Options
 from bdgs_ros.bench.sequences import REAL
 from bdgs_ros.core.config import BdgsConfig
@@ -15,10 +16,13 @@ from bdgs_ros.eval.belief_score import BeliefScore
 
 if TYPE_CHECKING:
     from bdgs_ros.data.synth.truth import SynthTruth
+    from bdgs_ros.job import Job
 
 NAME = 'belief'
 SEEDS = 5
 PARALLEL = True
+summarise = belief_summary.summarise
+overviews = belief_summary.overviews
 PROTOCOL = """
 Every frame goes through the pipeline in order, none dropped; truth is used for the figures alone.
 A Gaussian is dynamic if it lies in front of everything that is static at that time (farther than
@@ -32,7 +36,7 @@ by the camera: rendered again at a keyframe within 1 s; settled: the same of sta
 rendered before, such as what was just put down. hidden_static: share of the static pixels that
 the map knows and belief does not show. label: dynamic pixels of the labels at camera rate. psnr:
 as in bench slam; psnr_hidden: pixels that something moving covered, psnr_rest: the others of the
-same views. inference_ms: beliefs of one keyframe, with the choice of what is deleted.
+same views. inference_ms: filter and multi-view update of one keyframe.
 """
 
 SWITCHES: dict[str, dict[str, str]] = {
@@ -48,7 +52,7 @@ TROUBLES: dict[str, dict[str, float]] = {
 }
 """The full configuration with a detector that misses, sees ghosts, or answers late."""
 
-_FULL, _GEOMETRIC = 'weights', 'geometric'
+_GEOMETRIC = 'geometric'
 _SWITCHED = ('walking_xyz', 'unknown_box', 'chair_moved')
 _TROUBLED = ('walking_xyz', 'crowd')
 _ALSO_GEOMETRIC = ('unknown_box', 'chair_moved')
@@ -59,10 +63,6 @@ _STARTS = {_CROWD: 300, sequences.synth_name('crowd'): 150}
 _UNKNOWN_KIND = 'box'
 _COST = 'gaussians_50000'
 
-_SCORED = (
-    'precision', 'recall', 'unknown_recall', 'false_removal_percent', 'restored_percent',
-    'settled_percent', 'hidden_static_percent',
-)  # fmt: skip
 _QUALITY = {
     'ate_cm': 'ate_rmse',
     'coverage_percent': 'coverage',
@@ -77,24 +77,20 @@ _QUALITY = {
     'frames': 'frames_in',
 }
 TABLES = {
-    'Beliefs': (*_SCORED, 'keyframes', 'inference_ms'),
+    'Beliefs': (*SCORED, 'keyframes', 'inference_ms'),
     'Pose, labels and render': (
         'ate_cm', 'coverage_percent', 'label_precision', 'label_recall', 'psnr_db',
         'psnr_hidden_db', 'psnr_rest_db', 'hidden_minus_rest_db', 'gaussians', 'frames',
     ),
     'Cost': ('cost_gaussians', 'cost_views', 'inference_50k_ms'),
 }  # fmt: skip
-_OVERVIEW = (
-    *_SCORED, 'ate_cm', 'label_precision', 'label_recall', 'psnr_db', 'hidden_minus_rest_db',
-)  # fmt: skip
-_WORST_IS_MOST = ('false_removal_percent', 'hidden_static_percent', 'ate_cm')
 
 
 def cells(options: Options) -> list[Cell]:
     """List the full configuration everywhere, then parts off, troubles, late starts, and cost."""
     if options.quick:
         seeds = options.seeds[:1]
-        return [_synth(name, _FULL, seed, options) for name in _QUICK_SCENARIOS for seed in seeds]
+        return [_synth(name, FULL, seed, options) for name in _QUICK_SCENARIOS for seed in seeds]
     return [
         *_main(options),
         *_few(SWITCHES, _SWITCHED, options),
@@ -107,9 +103,9 @@ def cells(options: Options) -> list[Cell]:
 def _main(options: Options) -> list[Cell]:
     from bdgs_ros.data.synth import scenarios
 
-    found = [_real(sequence.name, _FULL, options) for sequence in REAL]
+    found = [_real(sequence.name, FULL, options) for sequence in REAL]
     for name in scenarios():
-        found += [_synth(name, _FULL, seed, options) for seed in options.seeds]
+        found += [_synth(name, FULL, seed, options) for seed in options.seeds]
         if name in _ALSO_GEOMETRIC:
             found += [_synth(name, _GEOMETRIC, seed, options) for seed in options.seeds]
     return found
@@ -167,35 +163,51 @@ def prepare(cell: Cell, options: Options) -> None:
 def run_cell(cell: Cell, options: Options) -> dict[str, Any]:
     """Run one recording with one configuration; its result files stay in the work folder."""
     from bdgs_ros.eval.belief_ledger import BeliefLedger
-    from bdgs_ros.job import Job, open_truth, run_job
+    from bdgs_ros.job import open_truth, run_job
 
-    settings = cell.settings
-    config = sequences.config_of(settings['values'], bool(settings.get('weights')), options)
-    if settings['kind'] == 'cost':
-        return belief_cost.measure(config)
-    recording = sequences.cell_recording(cell, options)
-    slam = _make_slam(cell, config)
+    job = _job(cell, options)
+    if job is None:
+        return belief_cost.measure(_config(cell, options))
+    slam = _make_slam(cell, job.config)
     times_ms = belief_cost.watch_inference(slam.mapper)
-    truth = open_truth(recording)
-    ledger = None if truth is None else BeliefLedger(slam.mapper, truth, _unknown(truth))
-    job = Job(
-        recording,
+    truth = open_truth(job.recording)
+    if truth is None:
+        return _row(run_job(job, slam)['metrics'], times_ms)
+    ledger = BeliefLedger(slam.mapper, truth, _unknown(truth))
+    row = _row(run_job(job, slam, [ledger], ledger.metrics)['metrics'], times_ms)
+    return {**row, **_scores(ledger.score(), any(o.is_mover for o in truth.objects))}
+
+
+def _config(cell: Cell, options: Options) -> BdgsConfig:
+    with_weights = bool(cell.settings.get('weights'))
+    return sequences.config_of(cell.settings['values'], with_weights, options)
+
+
+def _job(cell: Cell, options: Options) -> Job | None:
+    """Return what is to be run; None for the cell that has no recording."""
+    from bdgs_ros.job import Job
+
+    if cell.settings['kind'] == 'cost':
+        return None
+    return Job(
+        sequences.cell_recording(cell, options),
         options.work / 'runs' / cell.key,
-        config,
-        start=settings['start'],
+        _config(cell, options),
+        start=cell.settings['start'],
         frames=sequences.frame_limit(cell),
         progress=options.jobs == 1,
         keyframes=False,
     )
-    observers, more = ([], tuple) if ledger is None else ([ledger], ledger.metrics)
-    metrics = run_job(job, slam, observers, more)['metrics']
+
+
+def _row(metrics: Mapping[str, Any], times_ms: Sequence[float]) -> dict[str, Any]:
     row = {column: metrics[n]['value'] for column, n in _QUALITY.items() if n in metrics}
+    if not row['gaussians']:  # without mapping there is no render to score
+        row = {column: value for column, value in row.items() if not column.endswith('_db')}
     if 'psnr_rest_db' in row:
         row['hidden_minus_rest_db'] = row['psnr_hidden_db'] - row['psnr_rest_db']
     if times_ms:
         row['inference_ms'] = float(np.median(times_ms))
-    if truth is not None and ledger is not None:
-        row.update(_scores(ledger.score(), any(o.is_mover for o in truth.objects)))
     return row
 
 
@@ -231,73 +243,3 @@ def _scores(score: BeliefScore, with_movers: bool) -> dict[str, Any]:
         'settled_percent': 100 * score.settled_share,
         'counts': score.counts(),
     }
-
-
-def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return medians over scenarios and seeds of the full configuration, the worst, and cost."""
-    full = [r for r in rows if r['configuration'] == _FULL and _is_synth(r)]
-    asked: dict[str, Any] = {
-        'recall': _median(full, 'recall'),
-        'precision': _median(full, 'precision'),
-        'false_removal': _share(_median(full, 'false_removal_percent')),
-        'restored': _share(_median(full, 'restored_percent')),
-        'unknown_recall': _median(full, 'unknown_recall'),
-    }
-    summary: dict[str, Any] = {}
-    for column in (*_OVERVIEW[3:], 'inference_ms'):
-        summary[f'{column}_median'] = _median(full, column)
-    for column in _OVERVIEW:
-        summary[f'{column}_worst'] = _worst(full, column)
-    pooled = BeliefScore()
-    for row in full:
-        pooled += BeliefScore.of(row.get('counts') or {})
-    summary.update(
-        pooled_recall=pooled.recall,
-        pooled_precision=pooled.precision,
-        pooled_false_removal=pooled.false_removal,
-        pooled_restored=pooled.restored_share,
-        inference_50k_ms=_median(rows, 'inference_50k_ms'),
-    )
-    return {**asked, **{name: value for name, value in summary.items() if value is not None}}
-
-
-def overviews(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[dict[str, Any]]]:
-    """Return median and worst of each recording and configuration over its seeds."""
-    found = []
-    for name in dict.fromkeys((row['sequence'], row['configuration']) for row in rows):
-        own = [row for row in rows if (row['sequence'], row['configuration']) == name]
-        line: dict[str, Any] = {'sequence': name[0], 'configuration': name[1], 'runs': len(own)}
-        for column in _OVERVIEW:
-            line[column] = _median(own, column)
-            line[f'{column}, worst'] = _worst(own, column)
-        found.append(line)
-    empty = {c for c in _OVERVIEW if all(line[c] is None for line in found)}
-    empty |= {f'{column}, worst' for column in empty}
-    return {
-        'Median and worst over seeds': [
-            {k: v for k, v in line.items() if k not in empty} for line in found
-        ]
-    }
-
-
-def _is_synth(row: Mapping[str, Any]) -> bool:
-    return str(row['sequence']).startswith(sequences.synth_name(''))
-
-
-def _known(rows: Iterable[Mapping[str, Any]], column: str) -> list[float]:
-    values = (row.get(column) for row in rows)
-    return [value for value in values if value is not None]
-
-
-def _median(rows: Sequence[Mapping[str, Any]], column: str) -> float | None:
-    values = _known(rows, column)
-    return float(np.median(values)) if values else None
-
-
-def _worst(rows: Sequence[Mapping[str, Any]], column: str) -> float | None:
-    values = _known(rows, column)
-    return (max if column in _WORST_IS_MOST else min)(values) if values else None
-
-
-def _share(percent: float | None) -> float | None:
-    return None if percent is None else percent / 100

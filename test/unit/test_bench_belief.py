@@ -134,6 +134,7 @@ def test_the_overview_has_median_and_worst_of_each_recording():
     assert crowd['recall'] == pytest.approx(0.8)
     assert crowd['recall, worst'] == 0.7
     assert 'psnr_db' not in crowd
+    assert 'gaussians_50000' not in {line['sequence'] for line in table}
 
 
 def test_the_page_has_the_overview(options):
