@@ -11,8 +11,8 @@ from bdgs_ros.core.config.param import param
 class LikelihoodConfig:
     """The logistic model w, b of Eq. 3 on the features of `belief.likelihood`."""
 
-    w_prior: float = param(6.0, 'weight of the detector prior')
-    w_object: float = param(0.0, 'weight of the detector prior over the surface')
+    w_prior: float = param(1.5, 'weight of the detector prior')
+    w_object: float = param(5.0, 'weight of the detector prior over the surface')
     w_edge: float = param(1.0, 'weight of the nearness of a mask')
     w_residual: float = param(0.0, 'weight of the signed depth residual')
     w_color: float = param(1.0, 'weight of the colour difference')
