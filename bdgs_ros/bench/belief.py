@@ -43,6 +43,7 @@ SWITCHES: dict[str, dict[str, str]] = {
     'no_belief': {'belief.enabled': 'false'},
     'no_multi_view': {'belief.multi_view': 'false'},
     'no_mapping': {'mapping.enabled': 'false'},
+    'no_feedback': {'tracking.refine.posterior': 'false'},
 }
 """The full configuration with one part off (Table 6)."""
 TROUBLES: dict[str, dict[str, float]] = {

@@ -102,7 +102,8 @@ class CameraTracker:
         if view is None:
             return
         self._follow(view)
-        pyramid = self._aligner.pyramid(view.color, view.depth_m, view.p_dynamic, view.camera)
+        posterior = view.p_dynamic if self._config.refine.posterior else None
+        pyramid = self._aligner.pyramid(view.color, view.depth_m, posterior, view.camera)
         self._model = Reference(view.T_world_camera, pyramid)
 
     def _follow(self, view: ModelView) -> None:

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from bdgs_ros.core import se3
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.config import BeliefConfig, MappingConfig
 from bdgs_ros.mapping.gaussians import GaussianMap, NewGaussians
@@ -87,4 +86,4 @@ def test_two_become_the_gaussian_with_their_moments() -> None:
     assert gaussians.keyframe_index.tolist() == [4]
     assert gaussians.observations.tolist() == [9]
     assert len(gaussians.moments['means'][0]) == 1
-    gaussians.belief.observe(1, se3.exp(np.zeros(6)), np.zeros(1, np.float32))
+    assert gaussians.belief.hidden.tolist() == [False]

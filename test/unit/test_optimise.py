@@ -119,7 +119,7 @@ def test_a_keyframe_that_is_a_little_off_moves_back_but_the_first_stays() -> Non
 
 def test_hidden_gaussians_are_frozen() -> None:
     gaussians, keyframe = scene()
-    gaussians.belief.smoothed[:100] = 0.9
+    gaussians.belief.hidden[:100] = True
     gaussians.belief.belief[:100] = 0.9
     before = {name: array[:100].copy() for name, array in gaussians.parameters.items()}
     Optimiser(CONFIG).run(gaussians, keyframe, [])

@@ -83,6 +83,7 @@ class RefineConfig:
     """Alignment to the rendered static map, which is smoother than a camera's image."""
 
     enabled: bool = param(True, 'refine against the rendered static map')
+    posterior: bool = param(True, "weigh residuals by the map's P(static), the feedback of 3.1")
     intensity_noise: float = param(
         0.03, 'least scale of colour residuals', unit='grey level in [0, 1]', low=1e-4, high=1.0
     )
