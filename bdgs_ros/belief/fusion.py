@@ -31,11 +31,21 @@ class State(IntEnum):
     DYNAMIC = 2
 
 
-def decide(belief: Array, margin: float) -> NDArray[np.uint8]:
-    """Return the `State` of each Gaussian, Eq. 6 with delta = `margin`."""
+def decide(
+    belief: Array, margin: float, before: NDArray[np.uint8] | None = None
+) -> NDArray[np.uint8]:
+    """
+    Return the `State` of each Gaussian, Eq. 6 with delta = `margin`, shape (N,).
+
+    With the states `before`, a decision holds until the belief crosses 1/2: what hovers about a
+    margin does not flicker.
+    """
     state = np.full(belief.shape, State.UNCERTAIN, np.uint8)
-    state[belief > 0.5 + margin] = State.DYNAMIC
-    state[belief < 0.5 - margin] = State.STATIC
+    dynamic, static = belief > 0.5 + margin, belief < 0.5 - margin
+    if before is not None:
+        dynamic |= (before == State.DYNAMIC) & (belief > 0.5)
+        static |= (before == State.STATIC) & (belief < 0.5)
+    state[dynamic], state[static] = State.DYNAMIC, State.STATIC
     return state
 
 
@@ -103,6 +113,8 @@ class BeliefTracker:
         """[N] posterior P(dynamic)"""
         self.smoothed = np.zeros(0, np.float32)
         """[N] Eq. 10"""
+        self.states = np.zeros(0, np.uint8)
+        """[N] Eq. 6"""
         self.hidden = np.zeros(0, bool)
         """[N] where M_g of Eq. 11 is 0"""
         self._void = np.zeros(0, bool)  # looked through when last seen
@@ -117,6 +129,8 @@ class BeliefTracker:
         self._base = np.concatenate([self._base, bayes.logit(initial.astype(np.float32))])
         self.belief = np.concatenate([self.belief, initial.astype(np.float32)])
         self.smoothed = np.concatenate([self.smoothed, start])
+        decided = decide(initial.astype(np.float32), self._config.margin)
+        self.states = np.concatenate([self.states, decided])
         shown = bayes.render_mask(start, self._config.mask_threshold)
         self.hidden = np.concatenate([self.hidden, ~shown])
         self._void = np.concatenate([self._void, np.zeros(len(initial), bool)])
@@ -127,7 +141,7 @@ class BeliefTracker:
         """Drop the Gaussians where `mask`, shape (N,), is False."""
         self._base, self.belief = self._base[mask], self.belief[mask]
         self.smoothed, self.hidden = self.smoothed[mask], self.hidden[mask]
-        self._void = self._void[mask]
+        self._void, self.states = self._void[mask], self.states[mask]
         for view in self.views:
             view.keep(mask)
 
@@ -148,6 +162,7 @@ class BeliefTracker:
         self._base, self.belief = mean(self._base), mean(self.belief)
         self.smoothed, self.hidden = mean(self.smoothed), most(self.hidden)
         self._void = most(self._void)
+        self.states = decide(self.belief, self._config.margin)
         for view in self.views:
             view.evidence = mean(view.evidence)
             view.visible, view.free = most(view.visible), most(view.free)
@@ -169,6 +184,7 @@ class BeliefTracker:
         self._make_room(view)
         self.views.append(view)
         self.belief = self._posterior(slice(None))
+        self.states = decide(self.belief, self._config.margin, self.states)
         self.smoothed = bayes.smooth(self.belief, self.smoothed, self._config.ema)
         self._mask()
 
@@ -199,6 +215,7 @@ class BeliefTracker:
     def restart(self, rows: Rows) -> None:
         """Take the posterior of Gaussians that have just come as their smoothed belief."""
         self.belief[rows] = self._posterior(rows)
+        self.states[rows] = decide(self.belief[rows], self._config.margin)
         self.smoothed[rows] = self.belief[rows]
         threshold = self._config.mask_threshold
         self.hidden[rows] = ~bayes.render_mask(self.smoothed[rows], threshold)
@@ -206,6 +223,7 @@ class BeliefTracker:
     def overwrite(self, belief: Array, where: Mask) -> None:
         """Set beliefs without any filtering, for runs that switch the filter off (Table 6)."""
         self.belief = np.where(where, belief, self.belief).astype(np.float32)
+        self.states = decide(self.belief, self._config.margin)
         self.restart_smoothing(self.belief.copy())
 
     def restart_smoothing(self, smoothed: Array) -> None:

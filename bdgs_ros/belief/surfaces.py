@@ -49,9 +49,7 @@ def find_surfaces(depth_m: DepthImage, depth_noise: float = KINECT_NOISE) -> Ind
     smooth = (far > 0) & (near - far < _STEP_SIGMA * depth_noise)
     for axis in (0, 1):
         smooth &= np.abs(_second_difference(inverse, axis)) < _CREASE_SIGMA * depth_noise
-    _, label, stats, _ = cv2.connectedComponentsWithStats(
-        smooth.astype(np.uint8), connectivity=4
-    )
+    _, label, stats, _ = cv2.connectedComponentsWithStats(smooth.astype(np.uint8), connectivity=4)
     large = stats[:, cv2.CC_STAT_AREA] >= _MIN_PX
     large[0] = False
     number = np.where(large, np.cumsum(large), 0).astype(np.int32)

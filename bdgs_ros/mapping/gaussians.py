@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bdgs_ros.belief.filter import logit
-from bdgs_ros.belief.fusion import BeliefTracker, decide
+from bdgs_ros.belief.fusion import BeliefTracker
 from bdgs_ros.belief.likelihood import Features
 from bdgs_ros.core.config import BeliefConfig
 from bdgs_ros.core.types import Pose
@@ -63,7 +63,6 @@ class GaussianMap:
     """
 
     def __init__(self, config: BeliefConfig, degree: int = 0) -> None:
-        self._config = config
         self.parameters: dict[str, Array] = {
             'means': np.zeros((0, 3), np.float32),
             'quats': np.zeros((0, 4), np.float32),
@@ -128,7 +127,7 @@ class GaussianMap:
     @property
     def states(self) -> NDArray[np.uint8]:
         """The decision of Eq. 6 for each Gaussian, [N]."""
-        return decide(self.belief.belief, self._config.margin)
+        return self.belief.states
 
     def visible_mask(self) -> NDArray[np.bool_]:
         """Return M_g of Eq. 11, [N]: True where a Gaussian is rendered."""

@@ -57,6 +57,12 @@ def test_decision_has_three_outcomes() -> None:
     ]
 
 
+def test_a_decision_holds_until_the_belief_crosses_one_half() -> None:
+    before = np.array([State.DYNAMIC, State.DYNAMIC, State.STATIC, State.UNCERTAIN], np.uint8)
+    after = decide(array(0.55, 0.45, 0.45, 0.55), 0.1, before)
+    assert after.tolist() == [State.DYNAMIC, State.UNCERTAIN, State.STATIC, State.UNCERTAIN]
+
+
 def test_posterior_is_the_weighted_product_of_eq_5() -> None:
     belief = tracker()
     evidence = [array(1.0, -0.5), array(0.7, 0.0), array(-0.2, -1.0)]

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bdgs_ros.belief.fusion import State
 from bdgs_ros.core import se3
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.config import BeliefConfig, MappingConfig
@@ -132,7 +133,7 @@ def test_the_penalty_makes_dynamic_gaussians_fainter() -> None:
     faint = []
     for weight in (0.0, 0.15):
         gaussians, keyframe = scene()
-        gaussians.belief.belief[:100] = gaussians.belief.smoothed[:100] = 0.65
+        gaussians.belief.states[:100] = State.DYNAMIC
         loss = replace(CONFIG.loss, dynamic=weight)
         Optimiser(replace(CONFIG, loss=loss)).run(gaussians, keyframe, [])
         faint.append(float(gaussians.logit_opacities[:100].mean()))
