@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bdgs_ros.belief import filter as bayes
+from bdgs_ros.belief.likelihood import Observation
 from bdgs_ros.core import se3
 from bdgs_ros.core.config import BeliefConfig
 from bdgs_ros.core.types import Pose
 
 Array = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+Rows = NDArray[np.int64]
 
 
 class State(IntEnum):
@@ -38,13 +41,42 @@ def temporal_weight(decay_rate: float, elapsed_s: float) -> float:
     return float(np.exp(-decay_rate * abs(elapsed_s)))
 
 
-@dataclass
-class _View:
-    """One remembered keyframe: where and when it was, and what it said (0 where not visible)."""
+@dataclass(eq=False)
+class View:
+    """One remembered keyframe and what it said about each Gaussian."""
 
-    stamp_ns: int
-    T_world_camera: Pose
+    observation: Observation
     evidence: Array
+    """[N] log-likelihood ratios; 0 where not visible"""
+    visible: Mask
+    """[N]"""
+    free: Mask
+    """[N] where it looked through the Gaussian"""
+    shared: dict[int, float] = field(default_factory=dict)
+    """The edges of the co-visibility graph: `covisibility` by stamp of the other keyframe."""
+
+    @property
+    def stamp_ns(self) -> int:
+        """Time of the keyframe."""
+        return self.observation.stamp_ns
+
+    def keep(self, mask: Mask) -> None:
+        """Drop Gaussians."""
+        self.evidence, self.visible = self.evidence[mask], self.visible[mask]
+        self.free = self.free[mask]
+
+    def append(self, count: int) -> None:
+        """Add Gaussians about which nothing was said."""
+        self.evidence = np.concatenate([self.evidence, np.zeros(count, np.float32)])
+        nothing = np.zeros(count, bool)
+        self.visible = np.concatenate([self.visible, nothing])
+        self.free = np.concatenate([self.free, nothing])
+
+
+def covisibility(a: Mask, b: Mask) -> float:
+    """Return the overlap coefficient of two sets of visible Gaussians, each [N]."""
+    smaller = min(np.count_nonzero(a), np.count_nonzero(b))
+    return float(np.count_nonzero(a & b) / smaller) if smaller else 0.0
 
 
 class BeliefTracker:
@@ -54,40 +86,44 @@ class BeliefTracker:
     The belief is held as a base, which has absorbed old evidence, plus the evidence of at most
     `config.views` remembered keyframes. The posterior of Eq. 5 is computed anew from both at
     each keyframe, so no observation enters twice. A keyframe that saw the scene from where an
-    earlier one did (closer than tau_t and tau_r) is absorbed into the base at once.
+    earlier one did (closer than tau_t and tau_r) takes its place; over the limit, the one that
+    shares least with the newest goes. What they said is absorbed into the base.
     """
 
     def __init__(self, config: BeliefConfig) -> None:
         self._config = config
-        self._views: list[_View] = []
         self._base = np.zeros(0, np.float32)
         self._stamp_ns: int | None = None
+        self.views: list[View] = []
+        """Remembered keyframes, oldest first."""
         self.belief = np.zeros(0, np.float32)
         """[N] posterior P(dynamic)"""
         self.smoothed = np.zeros(0, np.float32)
         """[N] Eq. 10"""
+        self.hidden = np.zeros(0, bool)
+        """[N] where M_g of Eq. 11 is 0"""
 
     def __len__(self) -> int:
         """Return the number of Gaussians."""
         return len(self.belief)
 
-    def append(self, initial: Array) -> None:
-        """Add Gaussians with the given beliefs, shape (M,)."""
-        initial = initial.astype(np.float32)
-        self._base = np.concatenate([self._base, bayes.logit(initial)])
-        self.belief = np.concatenate([self.belief, initial])
-        self.smoothed = np.concatenate([self.smoothed, initial])
-        nothing = np.zeros(len(initial), np.float32)
-        for view in self._views:
-            view.evidence = np.concatenate([view.evidence, nothing])
+    def append(self, initial: Array, smoothed: Array | None = None) -> None:
+        """Add Gaussians with the given beliefs and smoothed beliefs, shape (M,)."""
+        start = np.asarray(initial if smoothed is None else smoothed, np.float32)
+        self._base = np.concatenate([self._base, bayes.logit(initial.astype(np.float32))])
+        self.belief = np.concatenate([self.belief, initial.astype(np.float32)])
+        self.smoothed = np.concatenate([self.smoothed, start])
+        shown = bayes.render_mask(start, self._config.mask_threshold)
+        self.hidden = np.concatenate([self.hidden, ~shown])
+        for view in self.views:
+            view.append(len(initial))
 
-    def keep(self, mask: NDArray[np.bool_]) -> None:
+    def keep(self, mask: Mask) -> None:
         """Drop the Gaussians where `mask`, shape (N,), is False."""
-        self._base = self._base[mask]
-        self.belief = self.belief[mask]
-        self.smoothed = self.smoothed[mask]
-        for view in self._views:
-            view.evidence = view.evidence[mask]
+        self._base, self.belief = self._base[mask], self.belief[mask]
+        self.smoothed, self.hidden = self.smoothed[mask], self.hidden[mask]
+        for view in self.views:
+            view.keep(mask)
 
     def pool(self, mean: Callable[[Array], Array]) -> None:
         """
@@ -99,36 +135,85 @@ class BeliefTracker:
             Takes values of all Gaussians, shape (N,), to those of the groups, shape (M,).
 
         """
-        self._base = mean(self._base)
-        self.belief = mean(self.belief)
-        self.smoothed = mean(self.smoothed)
-        for view in self._views:
-            view.evidence = mean(view.evidence)
 
-    def observe(self, stamp_ns: int, T_world_camera: Pose, evidence: Array) -> None:
+        def most(flags: Mask) -> Mask:
+            return np.asarray(mean(flags.astype(np.float32)) > 0.5)
+
+        self._base, self.belief = mean(self._base), mean(self.belief)
+        self.smoothed, self.hidden = mean(self.smoothed), most(self.hidden)
+        for view in self.views:
+            view.evidence = mean(view.evidence)
+            view.visible, view.free = most(view.visible), most(view.free)
+
+    def observe(self, view: View) -> None:
         """
-        Take the evidence of one keyframe and recompute every belief, Eq. 1-5 and 10.
+        Take what one keyframe says and recompute every belief, Eq. 1-6, 10 and 11.
 
         Parameters
         ----------
-        stamp_ns : int
-            Time of the keyframe.
-        T_world_camera : ndarray, shape (4, 4)
-            Its pose, for the choice of diverse views.
-        evidence : ndarray, shape (N,)
-            Log-likelihood ratios; 0 where a Gaussian was not visible.
+        view : View
+            Its evidence is 0 where a Gaussian was not visible; those only decay.
 
         """
-        self._decay_base(stamp_ns)
-        self._make_room(T_world_camera, stamp_ns)
-        self._views.append(_View(stamp_ns, T_world_camera, evidence.astype(np.float32)))
-        self.belief = bayes.update(bayes.sigmoid(self._base), self._fused(stamp_ns), self._limit)
+        self._decay_base(view.stamp_ns)
+        view.shared = {
+            other.stamp_ns: covisibility(view.visible, other.visible) for other in self.views
+        }
+        self._make_room(view)
+        self.views.append(view)
+        self.belief = self._posterior(slice(None))
         self.smoothed = bayes.smooth(self.belief, self.smoothed, self._config.ema)
+        self._mask()
 
-    def overwrite(self, belief: Array, where: NDArray[np.bool_]) -> None:
+    def recall(self, view: View, rows: Rows, said: View) -> None:
+        """
+        Take what a remembered keyframe says about Gaussians that came after it.
+
+        Parameters
+        ----------
+        view : View
+            The remembered keyframe.
+        rows : ndarray of int, shape (M,)
+            Which Gaussians.
+        said : View
+            About these, [M] each.
+
+        """
+        view.evidence[rows] = said.evidence
+        view.visible[rows] = said.visible
+        view.free[rows] = said.free
+
+    def restart(self, rows: Rows) -> None:
+        """Take the posterior of Gaussians that have just come as their smoothed belief."""
+        self.belief[rows] = self._posterior(rows)
+        self.smoothed[rows] = self.belief[rows]
+        threshold = self._config.mask_threshold
+        self.hidden[rows] = ~bayes.render_mask(self.smoothed[rows], threshold)
+
+    def overwrite(self, belief: Array, where: Mask) -> None:
         """Set beliefs without any filtering, for runs that switch the filter off (Table 6)."""
         self.belief = np.where(where, belief, self.belief).astype(np.float32)
-        self.smoothed = self.belief.copy()
+        self.restart_smoothing(self.belief.copy())
+
+    def restart_smoothing(self, smoothed: Array) -> None:
+        """Set the smoothed beliefs, shape (N,), and hide by them alone."""
+        self.smoothed = smoothed
+        self.hidden = ~bayes.render_mask(smoothed, self._config.mask_threshold)
+
+    def seen_through(self) -> Array:
+        """Return the share of the remembered keyframes that looked through each Gaussian, [N]."""
+        free, visible = np.zeros(len(self), np.float32), np.zeros(len(self), np.float32)
+        for view in self.views:
+            free += view.free
+            visible += view.visible
+        return np.asarray(free / np.maximum(visible, 1), np.float32)
+
+    def _mask(self) -> None:
+        """Apply Eq. 11; what is hidden comes back only some way below the threshold."""
+        config = self._config
+        back = np.float32(config.mask_threshold - config.mask_hysteresis)
+        limit = np.where(self.hidden, back, np.float32(config.mask_threshold))
+        self.hidden = self.smoothed >= limit
 
     @property
     def _limit(self) -> float:
@@ -144,17 +229,21 @@ class BeliefTracker:
             self._base = bayes.logit(predicted)
         self._stamp_ns = stamp_ns
 
-    def _make_room(self, T_world_camera: Pose, stamp_ns: int) -> None:
-        """Absorb the view that adds least: one from the same place, or the oldest."""
+    def _make_room(self, new: View) -> None:
+        """Absorb views from the same place, and over the limit those that share least."""
+        pose = new.observation.T_world_camera
+        for view in list(self.views):
+            if not self._diverse(view.observation.T_world_camera, pose):
+                self._absorb(view, new.stamp_ns)
         limit = self._config.views if self._config.multi_view else 1
-        similar = [v for v in self._views if not self._diverse(v.T_world_camera, T_world_camera)]
-        for view in similar or self._views[: max(0, len(self._views) - limit + 1)]:
-            self._absorb(view, stamp_ns)
+        while len(self.views) >= limit:
+            least = min(self.views, key=lambda view: new.shared[view.stamp_ns])
+            self._absorb(least, new.stamp_ns)
 
-    def _absorb(self, view: _View, stamp_ns: int) -> None:
+    def _absorb(self, view: View, stamp_ns: int) -> None:
         absorbed = self._base + self._weight(view, stamp_ns) * view.evidence
         self._base = np.clip(absorbed, -self._limit, self._limit)
-        self._views = [v for v in self._views if v is not view]
+        self.views.remove(view)
 
     def _diverse(self, T_world_a: Pose, T_world_b: Pose) -> bool:
         T_a_b = se3.inverse(T_world_a) @ T_world_b
@@ -164,13 +253,14 @@ class BeliefTracker:
             move > self._config.diversity_translation or turn > self._config.diversity_rotation_deg
         )
 
-    def _fused(self, stamp_ns: int) -> Array:
-        """Sum w_k z_k over the remembered keyframes, the logarithm of the product in Eq. 5."""
-        total = np.zeros_like(self._base)
-        for view in self._views:
-            total += self._weight(view, stamp_ns) * view.evidence
-        return total
+    def _posterior(self, rows: Rows | slice) -> Array:
+        """Return beliefs by Eq. 5: the sum of w_k z_k is the logarithm of its product."""
+        assert self._stamp_ns is not None
+        total = np.zeros_like(self._base[rows])
+        for view in self.views:
+            total += self._weight(view, self._stamp_ns) * view.evidence[rows]
+        return bayes.update(bayes.sigmoid(self._base[rows]), total, self._limit)
 
-    def _weight(self, view: _View, stamp_ns: int) -> np.float32:
+    def _weight(self, view: View, stamp_ns: int) -> np.float32:
         elapsed_s = (stamp_ns - view.stamp_ns) * 1e-9
         return np.float32(temporal_weight(self._config.decay_rate, elapsed_s))

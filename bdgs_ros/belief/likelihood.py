@@ -7,25 +7,47 @@ memorises them. A Gaussian that something nearer hides gets no evidence.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.config.belief import LikelihoodConfig
-from bdgs_ros.core.types import DepthImage, Pose, ProbabilityImage
+from bdgs_ros.core.types import DYNAMIC_THRESHOLD, DepthImage, Pose, ProbabilityImage
 
 Array = NDArray[np.float32]
+Mask = NDArray[np.bool_]
 
-FEATURES = ('prior', 'free_space', 'agreement', 'color', 'bias')
+FEATURES = (
+    'prior',
+    'edge',
+    'residual',
+    'color',
+    'warp',
+    'free_space',
+    'visibility',
+    'streak',
+    'age',
+    'observations',
+    'agreement',
+    'bias',
+)
+
+_KERNEL = np.ones((3, 3), np.uint8)
+_EDGE_PX = 4.0  # beyond a mask, in which its rim fades, at the width of the keyframe
+_COLOR_FLOOR = 0.01  # of the median difference: noise of a still image
+_MOST_COLOR = 5.0  # medians
+_LONG_STREAK, _LONG_AGE, _MANY = 5, 50, 30  # keyframes at which a feature saturates
 
 
 @dataclass(frozen=True)
 class Observation:
     """One keyframe as the likelihood sees it, at any one resolution."""
 
-    T_camera_world: Pose
+    stamp_ns: int
+    T_world_camera: Pose
     camera: PinholeCamera
     color: Array
     """[H, W, 3] in [0, 1]"""
@@ -34,27 +56,65 @@ class Observation:
 
 
 @dataclass(frozen=True)
+class Points:
+    """What is known of N Gaussians before a keyframe; each is of shape [N] or [N, 3]."""
+
+    means: Array
+    """Metres in world."""
+    colors: Array
+    """RGB in [0, 1]."""
+    visibility: Array
+    """alpha T: the largest weight with which it was blended into a recent image."""
+    streak: NDArray[np.int32]
+    """Keyframes in a row that measured it where it is."""
+    age: NDArray[np.int32]
+    """Keyframes since it came."""
+    observations: NDArray[np.int32]
+    """Keyframes that saw it."""
+    seen_through: Array
+    """Share of the remembered keyframes which looked through it."""
+
+    def take(self, rows: NDArray[np.int64]) -> Points:
+        """Return some of them."""
+        return Points(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+
+@dataclass(frozen=True)
 class Features:
     """Feature vectors of all Gaussians, and which of them were seen."""
 
     values: Array
     """[N, len(FEATURES)]; zero where not visible"""
-    visible: NDArray[np.bool_]
+    visible: Mask
     """[N]"""
 
+    def column(self, name: str) -> Array:
+        """Return one feature of all Gaussians, [N]."""
+        return self.values[:, FEATURES.index(name)]
 
-def extract(
-    means: Array, colors: Array, observation: Observation, config: LikelihoodConfig
-) -> Features:
+    @property
+    def agrees(self) -> Mask:
+        """Where the camera measured the Gaussian where it is, [N]."""
+        return np.asarray(self.column('agreement') > 0)
+
+    @property
+    def seen_through(self) -> Mask:
+        """Where the camera looked through the Gaussian, [N]."""
+        return np.asarray(self.column('free_space') > 0)
+
+
+def extract(points: Points, observation: Observation, config: LikelihoodConfig) -> Features:
     """
     Compute f_t of Eq. 3 for every Gaussian.
 
+    A Gaussian is seen where the measured depth agrees with it, within `gate_sigma`, or where
+    every depth around its pixel lies beyond it: at the rim of something nearer an error of a
+    pixel must not pass for free space.
+
     Parameters
     ----------
-    means : ndarray, shape (N, 3)
-        Centres in world, metres.
-    colors : ndarray, shape (N, 3)
-        RGB in [0, 1].
+    points : Points
+        All Gaussians.
     observation : Observation
         The keyframe.
     config : LikelihoodConfig
@@ -63,56 +123,100 @@ def extract(
     Returns
     -------
     features : Features
-        `prior`: P(dynamic) of the labels at the projection, where depth agrees; silence of the
-        detector is no evidence, since it does not know every mover;
-        `free_space`: how far, in sigma_z beyond the gate, the camera saw through the Gaussian,
-        saturated at 1; `agreement`: 1 where the measured depth is that of the Gaussian;
-        `color`: absolute colour difference where depth agrees; `bias`: 1.
+        Where depth agrees: `prior`, P(dynamic) of the labels at the projection (silence of the
+        detector is no evidence, since it does not know every mover); `edge`, nearness of the next
+        labelled pixel; `residual`, signed, in gates, positive where the surface is farther;
+        `color`, absolute difference over its median, saturated; `warp`, share of the remembered
+        keyframes in which this place was free (depth warp of DG-SLAM); `visibility`; `streak`;
+        `agreement`, 1. Where seen through: `free_space`, how far beyond the gate, in gates,
+        saturated. Where either: `age` and `observations`, logarithmic and saturated; `bias`, 1.
 
     """
-    pixel, z, inside = _project(means, observation)
-    values = np.zeros((len(means), len(FEATURES)), np.float32)
-    row, column = pixel[inside, 1], pixel[inside, 0]
-    measured = observation.depth_m[row, column]
-    sigma = config.depth_noise * z[inside] ** 2 + config.depth_floor
-    residual = np.where(measured > 0, (measured - z[inside]) / sigma, -np.inf)
-    seen = residual > -config.gate_sigma
-    agree = seen & (residual < config.gate_sigma)
-    violation = np.clip((residual - config.gate_sigma) / config.gate_sigma, 0, 1)
-    prior = observation.p_dynamic[row, column].astype(np.float32) / 255
-    difference = np.abs(observation.color[row, column] - colors[inside]).mean(axis=1)
-    block = np.stack(
-        [
-            np.where(agree, prior, 0),
-            violation,
-            agree,
-            np.where(agree, difference, 0),
-            np.ones_like(prior),
-        ],
-        axis=1,
-    )
-    index = np.flatnonzero(inside)
-    values[index] = np.where(seen[:, None], block, 0)
-    visible = np.zeros(len(means), bool)
+    index, row, column, z = _project(points.means, observation)
+    depth_m = observation.depth_m
+    measured = depth_m[row, column]
+    gate = config.gate_sigma * (config.depth_noise * z**2 + config.depth_floor)
+    residual = (measured - z) / gate
+    agree = (measured > 0) & (np.abs(residual) < 1)
+    # erode takes a hole, which is 0, as the nearest depth: nothing is known there
+    violation = np.clip((cv2.erode(depth_m, _KERNEL)[row, column] - z) / gate - 1, 0, 1)
+    violation[agree] = 0
+    seen = agree | (violation > 0)
+    near = points.take(index)
+    on_surface: dict[str, Array | np.float32] = {
+        'prior': observation.p_dynamic[row, column].astype(np.float32) / np.float32(255),
+        'edge': _rim(observation.p_dynamic)[row, column],
+        'residual': residual,
+        'color': _color_difference(observation.color[row, column], near.colors, agree),
+        'warp': near.seen_through,
+        'visibility': near.visibility,
+        'streak': np.minimum(near.streak.astype(np.float32) / _LONG_STREAK, np.float32(1)),
+        'agreement': np.float32(1),
+    }
+    whenever: dict[str, Array | np.float32] = {
+        'free_space': violation,
+        'age': _saturating(near.age, _LONG_AGE),
+        'observations': _saturating(near.observations, _MANY),
+        'bias': np.float32(1),
+    }
+    block = np.zeros((len(index), len(FEATURES)), np.float32)
+    for name, value in on_surface.items():
+        block[:, FEATURES.index(name)] = np.where(agree, value, 0)
+    for name, value in whenever.items():
+        block[:, FEATURES.index(name)] = np.where(seen, value, 0)
+    return _scatter(len(points.means), index, block, seen)
+
+
+def _scatter(count: int, index: NDArray[np.int64], block: Array, seen: Mask) -> Features:
+    values = np.zeros((count, len(FEATURES)), np.float32)
+    values[index] = block
+    visible = np.zeros(count, bool)
     visible[index] = seen
     return Features(values, visible)
 
 
+def _rim(p_dynamic: ProbabilityImage) -> Array:
+    """Return how near the next labelled pixel is, 1 to 0; 0 on labelled pixels, [H, W]."""
+    free = (p_dynamic < DYNAMIC_THRESHOLD).astype(np.uint8)
+    if free.all():
+        return np.zeros(p_dynamic.shape, np.float32)
+    away_px = cv2.distanceTransform(free, cv2.DIST_L2, 3)
+    return np.where(free > 0, np.exp(-away_px / _EDGE_PX), 0).astype(np.float32)
+
+
+def _color_difference(seen: Array, own: Array, agree: Mask) -> Array:
+    """Return absolute differences over their median where depth agrees, in [0, 1], [M]."""
+    difference = np.abs(seen - own).mean(axis=1)
+    median = float(np.median(difference[agree])) if agree.any() else 0.0
+    relative = difference / np.float32(_MOST_COLOR * max(median, _COLOR_FLOOR))
+    return np.asarray(np.minimum(relative, 1), np.float32)
+
+
+def _saturating(count: NDArray[np.int32], many: int) -> Array:
+    """Return log(1 + count), 1 from `many` on."""
+    share = np.log1p(count.astype(np.float32)) / np.float32(np.log1p(many))
+    return np.asarray(np.minimum(share, 1), np.float32)
+
+
 def _project(
     means: Array, observation: Observation
-) -> tuple[NDArray[np.int64], Array, NDArray[np.bool_]]:
-    """Return nearest pixel (u, v), camera z and whether the pixel lies inside the image."""
-    T = observation.T_camera_world.astype(np.float32)
-    points = means @ T[:3, :3].T + T[:3, 3]
-    z = points[:, 2]
-    front = z > 0.05
-    safe = np.where(front, z, 1.0)
+) -> tuple[NDArray[np.int64], NDArray[np.intp], NDArray[np.intp], Array]:
+    """Return which centres lie in the image, their nearest row and column, and camera z."""
     camera = observation.camera
-    u = np.rint(camera.fx * points[:, 0] / safe + camera.cx)
-    v = np.rint(camera.fy * points[:, 1] / safe + camera.cy)
-    inside = front & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    pixel = np.where(inside[:, None], np.stack([u, v], axis=1), 0).astype(np.int64)
-    return pixel, z, inside
+    R = observation.T_world_camera[:3, :3].astype(np.float32)
+    t = observation.T_world_camera[:3, 3].astype(np.float32)
+    x, y, z = ((means - t) @ R).T
+    inverse_z = np.float32(1) / np.where(z > 0.05, z, np.float32(np.inf))
+    u = np.rint(np.float32(camera.fx) * x * inverse_z + np.float32(camera.cx))
+    v = np.rint(np.float32(camera.fy) * y * inverse_z + np.float32(camera.cy))
+    inside = (inverse_z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    index = np.flatnonzero(inside)
+    return index, v[index].astype(np.intp), u[index].astype(np.intp), z[index]
+
+
+def weights(config: LikelihoodConfig) -> Array:
+    """Return w of Eq. 3 in the order of `FEATURES`; b is the weight of `bias`."""
+    return np.array([getattr(config, f'w_{name}') for name in FEATURES], np.float32)
 
 
 def evidence(features: Features, config: LikelihoodConfig) -> Array:
@@ -122,14 +226,9 @@ def evidence(features: Features, config: LikelihoodConfig) -> Array:
     `p(o | dynamic) = sigmoid(w.f + b)` and `p(o | static) = 1 - p(o | dynamic)`, so their
     log-ratio is the argument of the sigmoid.
     """
-    weights = np.array(
-        [config.w_prior, config.w_free_space, config.w_agreement, config.w_color, config.bias],
-        np.float32,
-    )
-    return np.asarray(features.values @ weights, dtype=np.float32)
+    return np.asarray(features.values @ weights(config), dtype=np.float32)
 
 
 def label(features: Features) -> Array:
     """Return the detector's P(dynamic) at each Gaussian, for runs without the filter."""
-    prior = features.values[:, FEATURES.index('prior')]
-    return np.where(features.values[:, FEATURES.index('agreement')] > 0, prior, 0.5)
+    return np.where(features.agrees, features.column('prior'), np.float32(0.5))

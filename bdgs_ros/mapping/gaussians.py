@@ -9,8 +9,9 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from bdgs_ros.belief.filter import logit, render_mask
+from bdgs_ros.belief.filter import logit
 from bdgs_ros.belief.fusion import BeliefTracker, decide
+from bdgs_ros.belief.likelihood import Features
 from bdgs_ros.core.config import BeliefConfig
 from bdgs_ros.core.types import Pose
 from bdgs_ros.mapping.groups import Groups
@@ -23,7 +24,15 @@ Scalar = TypeVar('Scalar', np.float32, np.int32)
 
 RASTERISED = ('means', 'quats', 'log_scales', 'logit_opacities', 'colors')
 PARAMETERS = (*RASTERISED, 'harmonics')
-_RECORDS = ('keyframe_index', 'observations', 'contribution', 'checks', 'confirmations')
+_RECORDS = (
+    'keyframe_index',
+    'observations',
+    'contribution',
+    'checks',
+    'confirmations',
+    'streak',
+    'violations',
+)
 
 
 @dataclass(frozen=True)
@@ -44,7 +53,9 @@ class GaussianMap:
     `parameters` holds the optimised arrays by their names in `PARAMETERS`; `moments` the first
     and second Adam moments of the same shapes; `keyframe_index` the keyframe that brought each
     Gaussian, [N] int32; `observations` how often it was seen, [N] int32. `contribution`, `checks`
-    and `confirmations` are what pruning remembers (`bdgs_ros.mapping.prune`), not saved.
+    and `confirmations` are what pruning remembers (`bdgs_ros.mapping.prune`), not saved, as are
+    `streak` and `violations`: keyframes in a row that measured a Gaussian where it is, or looked
+    through it.
     """
 
     def __init__(self, config: BeliefConfig, degree: int = 0) -> None:
@@ -64,6 +75,8 @@ class GaussianMap:
         self.contribution = np.zeros(0, np.float32)
         self.checks = np.zeros(0, np.int32)
         self.confirmations = np.zeros(0, np.int32)
+        self.streak = np.zeros(0, np.int32)
+        self.violations = np.zeros(0, np.int32)
 
     def __len__(self) -> int:
         """Return the number of Gaussians."""
@@ -111,7 +124,7 @@ class GaussianMap:
 
     def visible_mask(self) -> NDArray[np.bool_]:
         """Return M_g of Eq. 11, [N]: True where a Gaussian is rendered."""
-        return render_mask(self.belief.smoothed, self._config.mask_threshold)
+        return ~self.belief.hidden
 
     def as_gaussians(
         self, shading: Shading | None = None, active: NDArray[np.bool_] | None = None
@@ -157,6 +170,8 @@ class GaussianMap:
         self.contribution = _join(self.contribution, np.ones(count, np.float32))
         self.checks = _join(self.checks, none)
         self.confirmations = _join(self.confirmations, none)
+        self.streak = _join(self.streak, none)
+        self.violations = _join(self.violations, none)
 
     def copy(self, rows: NDArray[np.int64]) -> None:
         """Add a copy of some Gaussians at the end, with optimiser state of its own."""
@@ -164,12 +179,17 @@ class GaussianMap:
             block = self.parameters[name][rows]
             self.parameters[name] = _join(self.parameters[name], block)
             self.moments[name] = [_join(m, np.zeros_like(block)) for m in self.moments[name]]
-        smoothed = np.concatenate([self.belief.smoothed, self.belief.smoothed[rows]])
-        self.belief.append(self.belief.belief[rows])
-        self.belief.smoothed = smoothed
+        self.belief.append(self.belief.belief[rows], self.belief.smoothed[rows])
         for name in _RECORDS:
             record = getattr(self, name)
             setattr(self, name, _join(record, record[rows]))
+
+    def note(self, features: Features) -> None:
+        """Count what a keyframe showed: who was seen, in place or through, and how often now."""
+        self.observations += features.visible
+        agrees, through = features.agrees, features.seen_through
+        self.streak = np.where(through, 0, self.streak + agrees).astype(np.int32)
+        self.violations = np.where(agrees, 0, self.violations + through).astype(np.int32)
 
     def keep(self, mask: NDArray[np.bool_]) -> None:
         """Drop the Gaussians where `mask`, shape (N,), is False."""
@@ -203,6 +223,8 @@ class GaussianMap:
         self.contribution = groups.most(self.contribution)
         self.checks = groups.most(self.checks)
         self.confirmations = groups.most(self.confirmations)
+        self.streak = groups.least(self.streak)
+        self.violations = groups.least(self.violations)
 
     def deform(self, transforms: Mapping[int, Pose]) -> None:
         """

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bdgs_ros.belief import likelihood
+from bdgs_ros.belief.likelihood import Observation
 from bdgs_ros.core import se3
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.config import BeliefConfig, MappingConfig
@@ -29,6 +29,7 @@ from bdgs_ros.mapping.depth_bend import DepthBend, RangeImage
 from bdgs_ros.mapping.exposure import fit_exposure
 from bdgs_ros.mapping.gaussians import GaussianMap
 from bdgs_ros.mapping.history import History
+from bdgs_ros.mapping.inference import Inference
 from bdgs_ros.mapping.keyframe_store import KeyframeSet
 from bdgs_ros.mapping.keyframes import (
     Level,
@@ -59,6 +60,7 @@ class Mapper:
         self._config = mapping
         self._belief = belief
         self._optimiser = Optimiser(mapping)
+        self._inference = Inference(belief)
         self.frozen = False
         """Localisation mode: keyframes are answered with a view, the map does not change."""
         self.reset()
@@ -157,31 +159,21 @@ class Mapper:
 
         Returns where the camera measured the depth of a Gaussian that is still there, [N].
         """
-        observation = likelihood.Observation(
-            se3.inverse(keyframe.T_world_camera),
-            keyframe.frame.camera,
-            self._in_map_colors(keyframe.frame),
-            keyframe.frame.depth_m,
+        frame = keyframe.frame
+        observation = Observation(
+            frame.stamp_ns,
+            keyframe.T_world_camera,
+            frame.camera,
+            self._in_map_colors(frame),
+            frame.depth_m,
             keyframe.p_dynamic,
         )
-        config = self._belief.likelihood
-        features = likelihood.extract(self.map.means, self.map.colors, observation, config)
-        self.map.observations += features.visible
-        if self._belief.enabled:
-            evidence = likelihood.evidence(features, config)
-            stamp_ns = keyframe.frame.stamp_ns
-            self.map.belief.observe(stamp_ns, keyframe.T_world_camera, evidence)
-        else:
-            self.map.belief.overwrite(likelihood.label(features), features.visible)
+        features = self._inference.observe(self.map, observation, self._count)
         prune.note_checks(self.map, features)
-        seen_through, agree = (
-            features.values[:, likelihood.FEATURES.index(name)] > 0
-            for name in ('free_space', 'agreement')
-        )
-        gone = prune.confirmed_gone(self.map, seen_through, self._belief)
+        gone = prune.confirmed_gone(self.map, self._belief)
         gone |= prune.unconfirmed(self.map, self._count, self._config.prune)
         self.map.keep(~gone)
-        return np.asarray(agree[~gone])
+        return np.asarray(features.agrees[~gone])
 
     def _look(self, keyframe: Keyframe, agree: Mask) -> Rendered:
         """Render the static map as a keyframe finds it; what adds nothing to such views goes."""
@@ -260,6 +252,8 @@ class Mapper:
         def grow(pixels: Mask, belief: float) -> None:
             new = lift(current, level, surface, pixels, belief, config)
             self.map.append(new, config.opacity, current.index)
+            rows = np.arange(len(self.map) - len(new.means), len(self.map))
+            self._inference.ask_memory(self.map, rows, current.index)
 
         everything = self.render_everything(current.T_world_camera, level.camera)
         unknown = ~growth.explained(level.depth_m, everything, sigma, config.depth_sigma)

@@ -199,7 +199,7 @@ def _from_columns(
     if rest:
         gaussians.parameters['harmonics'] = block(*rest)
     gaussians.resize_colors((degree_of(len(rest)) or 0) if degree is None else degree)
-    gaussians.belief.smoothed = column.get('p_dynamic_smoothed', belief).copy()
+    gaussians.belief.restart_smoothing(column.get('p_dynamic_smoothed', belief).copy())
     zero = np.zeros(count, np.float32)
     gaussians.keyframe_index = column.get('keyframe_index', zero).astype(np.int32)
     gaussians.observations = column.get('observations', zero).astype(np.int32)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bdgs_ros.belief.filter import sigmoid
-from bdgs_ros.belief.likelihood import FEATURES, Features
+from bdgs_ros.belief.likelihood import Features
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.config import BeliefConfig
 from bdgs_ros.core.config.mapping import PruneConfig
@@ -78,8 +78,7 @@ def redundant(gaussians: GaussianMap, config: PruneConfig) -> Mask:
 
 def note_checks(gaussians: GaussianMap, features: Features) -> None:
     """Count the keyframes that could see each Gaussian, and those that saw something there."""
-    labelled = features.values[:, FEATURES.index('prior')] > 0.5
-    agree = (features.values[:, FEATURES.index('agreement')] > 0) & ~labelled
+    agree = features.agrees & (features.column('prior') <= 0.5)
     gaussians.checks += features.visible
     gaussians.confirmations += agree
 
@@ -104,14 +103,16 @@ def unconfirmed(gaussians: GaussianMap, newest_index: int, config: PruneConfig) 
     return np.asarray(young & enough & seldom)
 
 
-def confirmed_gone(gaussians: GaussianMap, seen_through: Mask, config: BeliefConfig) -> Mask:
+def confirmed_gone(gaussians: GaussianMap, config: BeliefConfig) -> Mask:
     """
     Return the Gaussians that may be deleted: believed dynamic, and free space where they were.
 
     Deletion is delayed on purpose: a Gaussian that is only believed to be dynamic stays frozen
-    and unrendered, so that it can come back.
+    and unrendered, so that it can come back. Free space must be confirmed by keyframes in a row,
+    as nvblox asks for a time.
     """
-    return np.asarray((gaussians.belief.smoothed > config.delete_above) & seen_through)
+    sure = gaussians.belief.smoothed > config.delete_above
+    return np.asarray(sure & (gaussians.violations >= config.delete_after))
 
 
 def usefulness(gaussians: GaussianMap) -> Array:

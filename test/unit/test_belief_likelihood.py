@@ -4,17 +4,28 @@ import numpy as np
 import pytest
 
 from bdgs_ros.belief import likelihood
-from bdgs_ros.belief.likelihood import FEATURES, Observation
+from bdgs_ros.belief.likelihood import FEATURES, Observation, Points
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.config.belief import LikelihoodConfig
 
 CAMERA = PinholeCamera(64, 48, 60.0, 60.0, 31.5, 23.5)
 CONFIG = LikelihoodConfig()
-GREY = np.full((1, 3), 0.5, np.float32)
+
+
+def points(means: np.ndarray, seen_through: float = 0.0, streak: int = 0) -> Points:
+    """Grey Gaussians about which little is known."""
+    n = len(means)
+    count = np.full(n, streak, np.int32)
+    share = np.full(n, seen_through, np.float32)
+    grey = np.full((n, 3), 0.5, np.float32)
+    return Points(
+        means.astype(np.float32), grey, np.ones(n, np.float32), count, count, count, share
+    )
 
 
 def observation(depth: float = 2.0, prior: int = 0, color: float = 0.5) -> Observation:
     return Observation(
+        0,
         np.eye(4),
         CAMERA,
         np.full((48, 64, 3), color, np.float32),
@@ -24,7 +35,7 @@ def observation(depth: float = 2.0, prior: int = 0, color: float = 0.5) -> Obser
 
 
 def evidence_at(z: float, seen: Observation) -> tuple[float, bool]:
-    features = likelihood.extract(np.array([[0, 0, z]], np.float32), GREY, seen, CONFIG)
+    features = likelihood.extract(points(np.array([[0, 0, z]])), seen, CONFIG)
     return float(likelihood.evidence(features, CONFIG)[0]), bool(features.visible[0])
 
 
@@ -61,7 +72,7 @@ def test_another_colour_at_the_same_depth_speaks_for_motion() -> None:
 
 @pytest.mark.parametrize('point', [(0, 0, -1.0), (0, 0, 0.01), (5, 0, 1.0), (0, -5, 1.0)])
 def test_outside_the_view_there_is_no_evidence(point: tuple[float, ...]) -> None:
-    features = likelihood.extract(np.array([point], np.float32), GREY, observation(), CONFIG)
+    features = likelihood.extract(points(np.array([point])), observation(), CONFIG)
     assert not features.visible.any()
     assert not features.values.any()
 
@@ -73,13 +84,11 @@ def test_missing_depth_is_no_evidence() -> None:
 
 
 def test_features_have_names() -> None:
-    features = likelihood.extract(
-        np.zeros((3, 3), np.float32), GREY.repeat(3, 0), observation(), CONFIG
-    )
+    features = likelihood.extract(points(np.zeros((3, 3))), observation(), CONFIG)
     assert features.values.shape == (3, len(FEATURES))
 
 
 def test_label_without_filter_is_the_prior_where_depth_agrees() -> None:
     means = np.array([[0, 0, 2.0], [0, 0, 3.0]], np.float32)
-    features = likelihood.extract(means, GREY.repeat(2, 0), observation(prior=255), CONFIG)
+    features = likelihood.extract(points(means), observation(prior=255), CONFIG)
     np.testing.assert_allclose(likelihood.label(features), [1.0, 0.5])

@@ -106,8 +106,9 @@ def test_what_is_remembered_follows_the_gaussians() -> None:
     assert gaussians.confirmations.tolist() == [4, 6]
 
 
-def test_only_what_is_seen_through_is_deleted() -> None:
-    gaussians = small_map([0.9] * 3, [0.01] * 3)
-    gaussians.belief.smoothed[:] = [0.99, 0.99, 0.2]
-    gone = prune.confirmed_gone(gaussians, np.array([True, False, True]), BeliefConfig())
-    assert gone.tolist() == [True, False, False]
+def test_only_what_is_seen_through_again_and_again_is_deleted() -> None:
+    gaussians = small_map([0.9] * 4, [0.01] * 4)
+    gaussians.belief.smoothed[:] = [0.99, 0.99, 0.2, 0.99]
+    gaussians.violations[:] = [2, 0, 2, 1]
+    gone = prune.confirmed_gone(gaussians, BeliefConfig(delete_after=2))
+    assert gone.tolist() == [True, False, False, False]

@@ -12,10 +12,17 @@ class LikelihoodConfig:
     """The logistic model w, b of Eq. 3 on the features of `belief.likelihood`."""
 
     w_prior: float = param(6.0, 'weight of the detector prior')
+    w_edge: float = param(1.0, 'weight of the nearness of a mask')
+    w_residual: float = param(0.0, 'weight of the signed depth residual')
+    w_color: float = param(1.0, 'weight of the colour difference')
+    w_warp: float = param(1.0, 'weight of free space in remembered keyframes')
     w_free_space: float = param(3.5, 'weight of a free-space violation')
+    w_visibility: float = param(0.0, 'weight of the share in the image')
+    w_streak: float = param(-0.5, 'weight of agreement in the keyframes before')
+    w_age: float = param(0.0, 'weight of the age')
+    w_observations: float = param(0.0, 'weight of the number of observations')
     w_agreement: float = param(-0.8, 'weight of a measured depth that agrees')
-    w_color: float = param(1.5, 'weight of the colour difference')
-    bias: float = param(0.2, 'b')
+    w_bias: float = param(0.2, 'b')
     depth_noise: float = param(
         0.004, 'sigma_z = depth_floor + depth_noise * z^2', unit='1/m', low=1e-5
     )
@@ -39,11 +46,17 @@ class BeliefConfig:
     margin: float = param(0.1, 'delta of Eq. 6', low=0.0, high=0.49)
     ema: float = param(0.6, 'rho of Eq. 10', low=0.01, high=1.0)
     mask_threshold: float = param(0.7, 'M_g of Eq. 11: rendered below', low=0.5, high=1.0)
+    mask_hysteresis: float = param(
+        0.1, 'what was hidden is rendered again below the threshold by this', low=0.0, high=0.5
+    )
     max_log_odds: float = param(6.0, 'beliefs are clamped at this', low=1.0, high=50.0)
     views: int = param(8, 'N of Eq. 5: keyframes whose evidence is kept', low=1, high=64)
     diversity_translation: float = param(0.1, 'tau_t', unit='m', low=0.0, high=10.0)
     diversity_rotation_deg: float = param(5.0, 'tau_r', unit='deg', low=0.0, high=180.0)
     delete_above: float = param(
-        0.95, 'a smoothed belief above, seen through, is deleted', low=0.5, high=1.0
+        0.9, 'a smoothed belief above, seen through, is deleted', low=0.5, high=1.0
+    )
+    delete_after: int = param(
+        2, 'keyframes in a row that must have looked through it', low=1, high=20
     )
     likelihood: LikelihoodConfig = field(default_factory=LikelihoodConfig)
