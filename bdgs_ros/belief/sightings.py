@@ -1,10 +1,11 @@
-"""What keyframes saw of Gaussians whose truth is known: the material that weights are fitted to."""
+"""What keyframes saw of Gaussians whose truth is known: what weights are fitted to."""
 
 from __future__ import annotations
 
 import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +36,8 @@ class Sightings:
     """Of the keyframes, [K]"""
     born_at: NDArray[np.int32]
     """Keyframe with which each Gaussian came, [G]"""
+    initial: Array
+    """Belief with which it came, [G]"""
     gaussian: NDArray[np.int32]
     """Who was seen, [R]"""
     seen_at: NDArray[np.int32]
@@ -88,7 +91,7 @@ class Fused:
     """Which sightings these are, [R]"""
 
 
-def fuse(sightings: Sightings, decay_rate: float, initial: float) -> Fused:
+def fuse(sightings: Sightings, decay_rate: float) -> Fused:
     """
     Add up the features that the filter was told, weighted as in Eq. 5.
 
@@ -98,8 +101,6 @@ def fuse(sightings: Sightings, decay_rate: float, initial: float) -> Fused:
         Of one recording.
     decay_rate : float
         alpha in 1/s.
-    initial : float
-        Belief with which every Gaussian began.
 
     Returns
     -------
@@ -127,7 +128,7 @@ def fuse(sightings: Sightings, decay_rate: float, initial: float) -> Fused:
         (sightings.truth != UNKNOWN) & (sightings.seen_at == sightings.known_at)
     )
     elapsed = seconds[sightings.known_at] - seconds[sightings.born_at[sightings.gaussian]]
-    start = float(logit(np.array([initial], np.float32))[0])
+    start = logit(sightings.initial)[sightings.gaussian]
     offset = (start * np.exp(-decay_rate * elapsed)).astype(np.float32)
     truth = sightings.truth == DYNAMIC
     return Fused(Examples(features, offset, truth).choose(known), count[known], known)
@@ -136,5 +137,5 @@ def fuse(sightings: Sightings, decay_rate: float, initial: float) -> Fused:
 def _by_keyframe(sightings: Sightings) -> Iterator[Rows]:
     """Yield the rows that became known with each keyframe, in order of time."""
     edges = np.flatnonzero(np.diff(sightings.known_at, prepend=-1, append=-1))
-    for start, stop in zip(edges[:-1], edges[1:], strict=True):
+    for start, stop in pairwise(edges.tolist()):
         yield np.arange(start, stop)

@@ -133,7 +133,10 @@ def _curve(p: NDArray[np.float64], truth: NDArray[np.bool_], bins: int) -> tuple
 def reliability_table(found: Calibration) -> str:
     """Write the reliability curve as a Markdown table."""
     return markdown_table(
-        [{'predicted': b.predicted, 'observed': b.observed, 'examples': b.count} for b in found.bins]
+        [
+            {'predicted': b.predicted, 'observed': b.observed, 'examples': b.count}
+            for b in found.bins
+        ]
     )
 
 

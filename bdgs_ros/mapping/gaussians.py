@@ -20,7 +20,7 @@ from bdgs_ros.mapping.rasterize import Gaussians
 from bdgs_ros.mapping.rotations import multiply, quats_from_axes
 
 Array = NDArray[np.float32]
-Scalar = TypeVar('Scalar', np.float32, np.int32)
+Scalar = TypeVar('Scalar', np.float32, np.int32, np.int64)
 
 RASTERISED = ('means', 'quats', 'log_scales', 'logit_opacities', 'colors')
 PARAMETERS = (*RASTERISED, 'harmonics')
@@ -32,6 +32,7 @@ _RECORDS = (
     'confirmations',
     'streak',
     'violations',
+    'serial',
 )
 
 
@@ -55,7 +56,9 @@ class GaussianMap:
     Gaussian, [N] int32; `observations` how often it was seen, [N] int32. `contribution`, `checks`
     and `confirmations` are what pruning remembers (`bdgs_ros.mapping.prune`), not saved, as are
     `streak` and `violations`: keyframes in a row that measured a Gaussian where it is, or looked
-    through it.
+    through it. `serial`, [N] int64, is a number that no other Gaussian of this map ever has or
+    had, from 0 in order of birth, by which it can be followed while others come and go; not
+    saved.
     """
 
     def __init__(self, config: BeliefConfig, degree: int = 0) -> None:
@@ -77,6 +80,8 @@ class GaussianMap:
         self.confirmations = np.zeros(0, np.int32)
         self.streak = np.zeros(0, np.int32)
         self.violations = np.zeros(0, np.int32)
+        self.serial = np.zeros(0, np.int64)
+        self._born = 0
 
     def __len__(self) -> int:
         """Return the number of Gaussians."""
@@ -172,6 +177,11 @@ class GaussianMap:
         self.confirmations = _join(self.confirmations, none)
         self.streak = _join(self.streak, none)
         self.violations = _join(self.violations, none)
+        self.serial = _join(self.serial, self._new_serials(count))
+
+    def _new_serials(self, count: int) -> NDArray[np.int64]:
+        self._born += count
+        return np.arange(self._born - count, self._born, dtype=np.int64)
 
     def copy(self, rows: NDArray[np.int64]) -> None:
         """Add a copy of some Gaussians at the end, with optimiser state of its own."""
@@ -183,6 +193,7 @@ class GaussianMap:
         for name in _RECORDS:
             record = getattr(self, name)
             setattr(self, name, _join(record, record[rows]))
+        self.serial[len(self) - len(rows) :] = self._new_serials(len(rows))
 
     def note(self, features: Features) -> None:
         """Count what a keyframe showed: who was seen, in place or through, and how often now."""
@@ -225,6 +236,7 @@ class GaussianMap:
         self.confirmations = groups.most(self.confirmations)
         self.streak = groups.least(self.streak)
         self.violations = groups.least(self.violations)
+        self.serial = self.serial[groups.leader]
 
     def deform(self, transforms: Mapping[int, Pose]) -> None:
         """
