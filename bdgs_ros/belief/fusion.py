@@ -20,6 +20,9 @@ Mask = NDArray[np.bool_]
 Rows = NDArray[np.int64]
 
 
+_MOST_LOG_ODDS = 10.0  # beyond, single precision does not tell beliefs apart
+
+
 class State(IntEnum):
     """The decision of Eq. 6."""
 
@@ -169,6 +172,10 @@ class BeliefTracker:
         """
         Take what a remembered keyframe says about Gaussians that came after it.
 
+        It tells what they start from. Keyframes that all saw a place empty say one thing, that
+        something came since, so together they say no more than `config.max_memory_log_odds`, and
+        as all that is old it fades by Eq. 4.
+
         Parameters
         ----------
         view : View
@@ -179,9 +186,11 @@ class BeliefTracker:
             About these, [M] each.
 
         """
-        view.evidence[rows] = said.evidence
-        view.visible[rows] = said.visible
-        view.free[rows] = said.free
+        assert self._stamp_ns is not None
+        view.visible[rows], view.free[rows] = said.visible, said.free
+        limit = self._config.max_memory_log_odds
+        told = self._base[rows] + self._weight(view, self._stamp_ns) * said.evidence
+        self._base[rows] = np.clip(told, -limit, limit)
 
     def restart(self, rows: Rows) -> None:
         """Take the posterior of Gaussians that have just come as their smoothed belief."""
@@ -254,12 +263,17 @@ class BeliefTracker:
         )
 
     def _posterior(self, rows: Rows | slice) -> Array:
-        """Return beliefs by Eq. 5: the sum of w_k z_k is the logarithm of its product."""
-        assert self._stamp_ns is not None
-        total = np.zeros_like(self._base[rows])
-        for view in self.views:
-            total += self._weight(view, self._stamp_ns) * view.evidence[rows]
-        return bayes.update(bayes.sigmoid(self._base[rows]), total, self._limit)
+        """
+        Return beliefs by Eq. 5: the sum of w_k z_k is the logarithm of its product.
+
+        What was known before the newest keyframe is clamped, as beliefs are in OctoMap, so that
+        one that shows a change can be heard.
+        """
+        known, newest = self._base[rows].copy(), self.views[-1]
+        for view in self.views[:-1]:
+            known += self._weight(view, newest.stamp_ns) * view.evidence[rows]
+        predicted = np.clip(known, -self._limit, self._limit)
+        return bayes.update(bayes.sigmoid(predicted), newest.evidence[rows], _MOST_LOG_ODDS)
 
     def _weight(self, view: View, stamp_ns: int) -> np.float32:
         elapsed_s = (stamp_ns - view.stamp_ns) * 1e-9

@@ -55,6 +55,11 @@ class Sightings:
         """Return the number of sightings, R."""
         return len(self.gaussian)
 
+    @property
+    def seconds(self) -> NDArray[np.float64]:
+        """Time of the keyframes since the first, [K]."""
+        return np.asarray((self.stamps_ns - self.stamps_ns[:1]) * 1e-9)
+
     def save(self, path: Path) -> None:
         """Write all arrays as .npz."""
         arrays = {field.name: getattr(self, field.name) for field in fields(self)}
@@ -102,36 +107,64 @@ def fuse(sightings: Sightings, decay_rate: float) -> Fused:
     decay_rate : float
         alpha in 1/s.
 
-    Returns
-    -------
-    fused : Fused
-        `features` are `F_t` and `offset` is what is left of the initial log-odds; see
-        `bdgs_ros.belief.logistic`.
-
     """
-    features = np.zeros_like(sightings.features)
+    shape = sightings.features.shape
+    memory, views = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     count = np.zeros(len(sightings), np.int32)
-    total = np.zeros((len(sightings.born_at), features.shape[1]), np.float32)
-    seen = np.zeros(len(total), np.int32)
-    seconds = (sightings.stamps_ns - sightings.stamps_ns[:1]) * 1e-9
-    now = np.zeros(len(total))
+    state = _State(sightings, decay_rate)
     for rows in _by_keyframe(sightings):
-        who, t = sightings.gaussian[rows], seconds[sightings.known_at[rows[0]]]
-        once = np.unique(who)
-        total[once] *= np.exp(-decay_rate * (t - now[once]))[:, None].astype(np.float32)
-        now[once] = t
-        weight = np.exp(-decay_rate * (t - seconds[sightings.seen_at[rows]])).astype(np.float32)
-        np.add.at(total, who, weight[:, None] * sightings.features[rows])
-        np.add.at(seen, who, 1)
-        features[rows], count[rows] = total[who], seen[who]
-    known = np.flatnonzero(
-        (sightings.truth != UNKNOWN) & (sightings.seen_at == sightings.known_at)
+        state.add(rows)
+        who = sightings.gaussian[rows]
+        memory[rows], views[rows], count[rows] = (
+            state.memory[who],
+            state.views[who],
+            state.seen[who],
+        )
+    at_once = sightings.seen_at == sightings.known_at
+    known = np.flatnonzero((sightings.truth != UNKNOWN) & at_once)
+    born_at = sightings.born_at[sightings.gaussian]
+    later = (sightings.known_at > born_at)[:, None]  # at birth all is told as memory
+    seconds = sightings.seconds
+    examples = Examples(
+        start=logit(sightings.initial)[sightings.gaussian],
+        fade=np.exp(-decay_rate * (seconds[sightings.known_at] - seconds[born_at])).astype(
+            np.float32
+        ),
+        memory=memory,
+        views=np.where(later, views - sightings.features, 0).astype(np.float32),
+        newest=np.where(later, sightings.features, 0).astype(np.float32),
+        truth=sightings.truth == DYNAMIC,
     )
-    elapsed = seconds[sightings.known_at] - seconds[sightings.born_at[sightings.gaussian]]
-    start = logit(sightings.initial)[sightings.gaussian]
-    offset = (start * np.exp(-decay_rate * elapsed)).astype(np.float32)
-    truth = sightings.truth == DYNAMIC
-    return Fused(Examples(features, offset, truth).choose(known), count[known], known)
+    return Fused(examples.choose(known), count[known], known)
+
+
+class _State:
+    """What the filter has been told of each Gaussian up to some keyframe."""
+
+    def __init__(self, sightings: Sightings, decay_rate: float) -> None:
+        shape = len(sightings.born_at), sightings.features.shape[1]
+        self._sightings = sightings
+        self._decay_rate = decay_rate
+        self._now = np.zeros(len(sightings.born_at))
+        self.memory = np.zeros(shape, np.float32)
+        self.views = np.zeros(shape, np.float32)
+        self.seen = np.zeros(len(sightings.born_at), np.int32)
+
+    def add(self, rows: Rows) -> None:
+        """Take the sightings that became known with one keyframe."""
+        said = self._sightings
+        who, now = said.gaussian[rows], said.seconds[said.known_at[rows[0]]]
+        once = np.unique(who)
+        self.views[once] *= self._weight(now - self._now[once])
+        self._now[once] = now
+        told = self._weight(now - said.seconds[said.seen_at[rows]]) * said.features[rows]
+        at_birth = said.born_at[who] == said.known_at[rows]
+        np.add.at(self.memory, who[at_birth], told[at_birth])
+        np.add.at(self.views, who[~at_birth], told[~at_birth])
+        np.add.at(self.seen, who, 1)
+
+    def _weight(self, elapsed_s: NDArray[np.float64]) -> Array:
+        return np.exp(-self._decay_rate * elapsed_s)[:, None].astype(np.float32)
 
 
 def _by_keyframe(sightings: Sightings) -> Iterator[Rows]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +12,16 @@ from numpy.typing import NDArray
 from bdgs_ros.belief import likelihood, logistic, sightings
 from bdgs_ros.belief.filter import sigmoid
 from bdgs_ros.belief.likelihood import FEATURES
-from bdgs_ros.belief.logistic import FREE, NEGATIVE, POSITIVE, Bounds, Examples, Weights
-from bdgs_ros.bench.likelihood_material import Material, Source
+from bdgs_ros.belief.logistic import (
+    FREE,
+    NEGATIVE,
+    POSITIVE,
+    Bounds,
+    Clamps,
+    Double,
+    Examples,
+)
+from bdgs_ros.bench.likelihood_material import MAP, SHADOW, Material, Source
 from bdgs_ros.core.config import BeliefConfig
 from bdgs_ros.core.errors import EvaluationError
 from bdgs_ros.eval.calibration import Calibration, calibration
@@ -20,8 +29,7 @@ from bdgs_ros.eval.calibration import Calibration, calibration
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-DECAY_RATES = (0.05, 0.1, 0.2, 0.4, 0.8)  # 1/s
-SHRINKAGES = (1e-5, 1e-4, 1e-3, 1e-2)
+SHRINKAGES = (1e-6, 1e-5, 1e-4, 1e-3)
 LEFT_OUT: Bounds = (0.0, 0.0)
 
 # Where more of a feature can only speak for one side, a weight of the other sign would be noise.
@@ -34,7 +42,7 @@ SIGNS: dict[str, Bounds] = {
     'streak': NEGATIVE,
 }
 
-_SEARCHED = 20_000  # examples of each run that the choice of alpha and shrinkage looks at
+_MOST = {SHADOW: 20_000, MAP: 5_000}  # examples of each run: more change nothing but the time
 
 
 @dataclass(frozen=True)
@@ -63,9 +71,9 @@ class Pool:
         return sorted({source.seed for source in self.sources})
 
 
-def pool(materials: Sequence[Material], decay_rate: float) -> Pool:
+def pool(materials: Sequence[Material], decay_rate: float, seed: int = 0) -> Pool:
     """
-    Put the material of all runs together.
+    Put the material of all runs together, at random where there is more than is needed.
 
     Parameters
     ----------
@@ -73,6 +81,8 @@ def pool(materials: Sequence[Material], decay_rate: float) -> Pool:
         Of the features of this version.
     decay_rate : float
         alpha of Eq. 5.
+    seed : int
+        Of the choice.
 
     Raises
     ------
@@ -80,15 +90,18 @@ def pool(materials: Sequence[Material], decay_rate: float) -> Pool:
         If nothing was seen whose truth is known.
 
     """
+    rng = np.random.default_rng(seed)
     parts, runs, kinds, counts, posteriors = [], [], [], [], []
     for run, material in enumerate(materials):
         for kind, seen in material.sightings.items():
             fused = sightings.fuse(seen, decay_rate)
-            parts.append(fused.examples)
-            counts.append(fused.count)
-            runs.append(np.full(len(fused.rows), run, np.int32))
-            kinds.append(np.full(len(fused.rows), kind == 'map'))
-            posteriors.append(seen.posterior[fused.rows])
+            total = len(fused.rows)
+            chosen = np.sort(rng.choice(total, min(total, _MOST[kind]), replace=False))
+            parts.append(fused.examples.choose(chosen))
+            counts.append(fused.count[chosen])
+            runs.append(np.full(len(chosen), run, np.int32))
+            kinds.append(np.full(len(chosen), kind == MAP))
+            posteriors.append(seen.posterior[fused.rows[chosen]])
     if not sum(map(len, parts)):
         raise EvaluationError(
             f'{len(materials)} runs left no example; take recordings in which the camera moves'
@@ -108,7 +121,17 @@ def bounds(without: str | None = None) -> list[Bounds]:
     return [LEFT_OUT if n == without else SIGNS.get(n, FREE) for n in FEATURES]
 
 
-def held_out(found: Pool, limits: list[Bounds], shrinkage: float, rows: Mask) -> Array:
+@dataclass(frozen=True)
+class Settings:
+    """What is chosen beside the weights."""
+
+    decay_rate: float
+    """alpha"""
+    clamps: Clamps
+    shrinkage: float
+
+
+def held_out(found: Pool, limits: list[Bounds], settings: Settings) -> Array:
     """
     Predict each seed by the weights that the others give.
 
@@ -118,23 +141,20 @@ def held_out(found: Pool, limits: list[Bounds], shrinkage: float, rows: Mask) ->
         Of at least two seeds.
     limits : list of tuple
         See `bounds`.
-    shrinkage : float
+    settings : Settings
         See `logistic.fit`.
-    rows : ndarray of bool, shape (R,)
-        What is fitted to, and predicted.
 
     Returns
     -------
     log_odds : ndarray, shape (R,)
-        0 where not in `rows`.
 
     """
     log_odds = np.zeros(len(found.examples), np.float32)
     for seed in found.seeds:
         own = found.of('seed', seed)
-        weights = logistic.fit(found.examples.choose(rows & ~own), limits, shrinkage)
-        test = rows & own
-        log_odds[test] = found.examples.choose(test).log_odds(weights)
+        others = found.examples.choose(~own)
+        weights = logistic.fit(others, limits, settings.shrinkage, settings.clamps)
+        log_odds[own] = found.examples.choose(own).log_odds(weights, settings.clamps)
     return log_odds
 
 
@@ -142,66 +162,39 @@ def held_out(found: Pool, limits: list[Bounds], shrinkage: float, rows: Mask) ->
 class Trial:
     """One combination in the search."""
 
-    decay_rate: float
-    shrinkage: float
+    settings: Settings
     log_loss: float
 
 
 def search(
     materials: Sequence[Material],
-    limit: float,
-    decay_rates: Iterable[float] = DECAY_RATES,
-    shrinkages: Iterable[float] = SHRINKAGES,
-    seed: int = 0,
+    decay_rates: Sequence[float],
+    clamps: Sequence[Clamps],
+    shrinkages: Sequence[float] = SHRINKAGES,
 ) -> list[Trial]:
-    """
-    Try decay rates and shrinkages on held-out seeds, best first.
-
-    Parameters
-    ----------
-    materials : sequence of Material
-        Of at least two seeds.
-    limit : float
-        Clamp of the log-odds.
-    decay_rates, shrinkages : iterable of float
-        What to combine.
-    seed : int
-        Of the choice of examples.
-
-    """
+    """Try all combinations on held-out seeds, best first."""
     trials = []
-    shrinkages = list(shrinkages)
     for decay_rate in decay_rates:
         found = pool(materials, decay_rate)
-        rows = _thinned(found, np.random.default_rng(seed))
-        for shrinkage in shrinkages:
-            log_odds = held_out(found, bounds(), shrinkage, rows)
-            score = scored(found, log_odds, limit, rows)
-            trials.append(Trial(decay_rate, shrinkage, score.log_loss))
+        for clamp, shrinkage in product(clamps, shrinkages):
+            settings = Settings(decay_rate, clamp, shrinkage)
+            log_odds = held_out(found, bounds(), settings)
+            trials.append(Trial(settings, scored(found, log_odds).log_loss))
     return sorted(trials, key=lambda trial: trial.log_loss)
 
 
-def _thinned(found: Pool, rng: np.random.Generator) -> Mask:
-    """Choose at most `_SEARCHED` examples of each run."""
-    size = np.bincount(found.run, minlength=len(found.sources))
-    share = np.minimum(1.0, _SEARCHED / np.maximum(size, 1))
-    return np.asarray(rng.random(len(found.run)) < share[found.run])
-
-
-def scored(found: Pool, log_odds: Array, limit: float, rows: Mask) -> Calibration:
-    """Compare predictions, clamped as the filter does, with the truth of some examples."""
-    predicted = sigmoid(np.clip(log_odds[rows], -limit, limit))
-    return calibration(predicted, found.examples.truth[rows])
+def scored(found: Pool, log_odds: Array, rows: Mask | slice = slice(None)) -> Calibration:
+    """Compare predictions with the truth of some examples."""
+    return calibration(sigmoid(log_odds[rows]), found.examples.truth[rows])
 
 
 @dataclass(frozen=True)
 class Learned:
     """Weights with all that is known about them."""
 
-    weights: Weights
+    weights: Double
     """Fitted to everything, in the order of `FEATURES`."""
-    decay_rate: float
-    shrinkage: float
+    settings: Settings
     trials: tuple[Trial, ...]
     pool: Pool
     log_odds: dict[str, Array]
@@ -212,19 +205,21 @@ def learn(
     materials: Sequence[Material],
     config: BeliefConfig,
     decay_rates: Sequence[float] = (),
+    clamps: Sequence[float] = (),
     leave_out: bool = True,
 ) -> Learned:
     """
-    Choose alpha and shrinkage, fit, and predict what was held out.
+    Choose what is to be chosen, fit, and predict what was held out.
 
     Parameters
     ----------
     materials : sequence of Material
         Of at least two seeds, since whole seeds are held out.
     config : BeliefConfig
-        What was in force before, to compare with; its clamp is kept.
-    decay_rates : sequence of float
-        To choose from; by default that of `config`.
+        What was in force before, to compare with.
+    decay_rates, clamps : sequence of float
+        To choose from: alpha, and the most that is known before a keyframe; by default those of
+        `config`.
     leave_out : bool
         Fit also without each feature.
 
@@ -240,16 +235,19 @@ def learn(
             f'weights are judged on seeds that they were not fitted to, but there is only '
             f'{seeds}; give at least two'
         )
-    limit = config.max_log_odds
-    trials = search(materials, limit, decay_rates or (config.decay_rate,))
-    best = trials[0]
-    found = pool(materials, best.decay_rate)
-    everything = np.ones(len(found.examples), bool)
+    trials = search(
+        materials,
+        decay_rates or (config.decay_rate,),
+        [Clamps(config.max_memory_log_odds, c) for c in clamps or (config.max_log_odds,)],
+    )
+    chosen = trials[0].settings
+    found = pool(materials, chosen.decay_rate)
+    before = likelihood.weights(config.likelihood).astype(np.float64)
     variants = {
-        'before': found.examples.log_odds(likelihood.weights(config.likelihood).astype(float)),
-        'fitted': held_out(found, bounds(), best.shrinkage, everything),
+        'before': found.examples.log_odds(before, chosen.clamps),
+        'fitted': held_out(found, bounds(), chosen),
     }
     for name in FEATURES if leave_out else ():
-        variants[f'without {name}'] = held_out(found, bounds(name), best.shrinkage, everything)
-    weights = logistic.fit(found.examples, bounds(), best.shrinkage)
-    return Learned(weights, best.decay_rate, best.shrinkage, tuple(trials), found, variants)
+        variants[f'without {name}'] = held_out(found, bounds(name), chosen)
+    weights = logistic.fit(found.examples, bounds(), chosen.shrinkage, chosen.clamps)
+    return Learned(weights, chosen, tuple(trials), found, variants)

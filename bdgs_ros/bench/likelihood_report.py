@@ -30,9 +30,9 @@ _PROTOCOL = """
 Every run is the whole pipeline on a synthetic recording. Examples are Gaussians at the keyframes
 that saw them: those of a shadow map, random pixels that no mask kept out, and every eighth of the
 map itself. They are dynamic if nothing of the static world of that time is where they are; what is
-too near to a surface to tell is left out. Predictions are what Eq. 5 says after all evidence up to
-then, without the decay of Eq. 4 between views; `fitted` predicts each seed with the weights that
-the other seeds give. `recall` and `precision` are those of the rendering mask of Eq. 11.
+too near to a surface to tell is left out. Predictions are what the filter says after all evidence
+up to then; `fitted` predicts each seed with the weights that the other seeds give. `recall` and
+`precision` are those of the rendering mask of Eq. 11, without hysteresis and smoothing.
 """
 
 
@@ -46,7 +46,7 @@ class Scorer:
     def calibration(self, variant: str, rows: Mask) -> Calibration:
         """Return the scores of a variant of `Learned.log_odds` on some examples."""
         log_odds = self._learned.log_odds[variant]
-        return scored(self._learned.pool, log_odds, self._config.max_log_odds, rows)
+        return scored(self._learned.pool, log_odds, rows)
 
     def row(self, variant: str, rows: Mask) -> dict[str, Any]:
         """Return the same as a row of a table, with what the mask of Eq. 11 would do."""
@@ -153,8 +153,13 @@ def _weights_table(learned: Learned, config: BeliefConfig) -> str:
 
 def _trials_table(learned: Learned) -> str:
     rows = [
-        {'alpha': t.decay_rate, 'shrinkage': t.shrinkage, 'log_loss': t.log_loss}
-        for t in learned.trials
+        {
+            'alpha': trial.settings.decay_rate,
+            'clamp': trial.settings.clamps.known,
+            'shrinkage': trial.settings.shrinkage,
+            'log_loss': trial.log_loss,
+        }
+        for trial in learned.trials
     ]
     return markdown_table(rows)
 
@@ -184,8 +189,9 @@ def provenance_of(
         'priors': sorted({source.detector for source in pool.sources}),
         'examples': len(pool.examples),
         'dynamic_examples': int(np.count_nonzero(pool.examples.truth)),
-        'decay_rate': learned.decay_rate,
-        'shrinkage': learned.shrinkage,
+        'decay_rate': learned.settings.decay_rate,
+        'max_log_odds': learned.settings.clamps.known,
+        'shrinkage': learned.settings.shrinkage,
         'held_out_log_loss': round(held_out.log_loss, 5),
         'held_out_brier': round(held_out.brier, 5),
     }

@@ -6,12 +6,15 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from bdgs_ros.cli.bench import default_data
 from bdgs_ros.cli.config import add_config_arguments, load_config, to_yaml
-from bdgs_ros.core.config import BdgsConfig, ParamSpec, specs, with_values
+from bdgs_ros.core.config import BdgsConfig, specs, with_values
 from bdgs_ros.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from bdgs_ros.bench.likelihood_fit import Settings
 
 NAME = 'fit-likelihood'
 HELP = 'learn the weights of the likelihood of Eq. 3 from synthetic recordings with truth'
@@ -27,7 +30,6 @@ _QUICK_FRAMES = 60
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    from bdgs_ros.bench.likelihood_fit import DECAY_RATES
     from bdgs_ros.bench.sequences import WEIGHTS
 
     parser.add_argument('--output', type=Path, required=True, metavar='DIR', help='results')
@@ -61,9 +63,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--no-weights', action='store_true', help='learn from the geometric prior alone'
     )
     parser.add_argument(
-        '--decay-rates', nargs='+', type=float, metavar='A',
-        help='alpha to choose from, for example ' + ' '.join(map(str, DECAY_RATES))
-        + ' (default: belief.decay_rate, fixed)',
+        '--decay-rates', nargs='+', type=float, metavar='A', default=[],
+        help='alpha to choose from (default: belief.decay_rate)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--clamps', nargs='+', type=float, metavar='L', default=[],
+        help='belief.max_log_odds to choose from (default: as it is)',
     )  # fmt: skip
     parser.add_argument(
         '--ship', action='store_true', help='make these weights the defaults of this checkout'
@@ -82,15 +87,18 @@ def run(arguments: argparse.Namespace) -> int:
     from bdgs_ros.eval.provenance import commit, commit_date
 
     config = load_config(arguments)
-    learned = learn(_materials(arguments, config), config.belief, arguments.decay_rates or ())
+    learned = learn(
+        _materials(arguments, config), config.belief, arguments.decay_rates, arguments.clamps
+    )
     command = 'bdgs fit-likelihood ' + _choices(arguments)
     date = arguments.date or commit_date()
     provenance = likelihood_report.provenance_of(learned, config.belief, command, commit(), date)
     weights = likelihood_report.rounded(learned)
     arguments.output.mkdir(parents=True, exist_ok=True)
     likelihood_report.write_report(arguments.output, learned, config.belief, provenance)
-    fitted = with_values(config, _values(weights, learned.decay_rate))
-    write_text(arguments.output / 'likelihood.yaml', to_yaml(_changed(fitted)))
+    values = _values(weights, learned.settings)
+    fitted = [spec for spec in specs(with_values(config, values)) if spec.name in values]
+    write_text(arguments.output / 'likelihood.yaml', to_yaml(fitted))
     if arguments.ship:
         write_text(shipped_path(), likelihood_report.as_module(weights, provenance))
     text = dump_json({'weights': weights, 'provenance': provenance})
@@ -134,7 +142,7 @@ def _refuse_unknown(names: Sequence[str], known: Sequence[str]) -> None:
 def _choices(arguments: argparse.Namespace) -> str:
     """Return the arguments that decide the result, as they would be typed."""
     words = []
-    for name in ('scenarios', 'seeds', 'decay_rates'):
+    for name in ('scenarios', 'seeds', 'decay_rates', 'clamps'):
         values = getattr(arguments, name)
         if values and tuple(values) != _SEEDS:
             words += [f'--{name.replace("_", "-")}', *map(str, values)]
@@ -144,15 +152,13 @@ def _choices(arguments: argparse.Namespace) -> str:
     return ' '.join([*words, *(f'--set {text}' for text in arguments.overrides)])
 
 
-def _values(weights: dict[str, float], decay_rate: float) -> dict[str, float]:
-    values = {f'belief.likelihood.w_{name}': weight for name, weight in weights.items()}
-    return {**values, 'belief.decay_rate': decay_rate}
-
-
-def _changed(config: BdgsConfig) -> list[ParamSpec]:
-    """Return the parameters that were learned."""
-    learned = 'belief.likelihood.w_', 'belief.decay_rate'
-    return [spec for spec in specs(config) if spec.name.startswith(learned)]
+def _values(weights: dict[str, float], settings: Settings) -> dict[str, float]:
+    """Return what was learned, by parameter."""
+    return {
+        'belief.decay_rate': settings.decay_rate,
+        'belief.max_log_odds': settings.clamps.known,
+        **{f'belief.likelihood.w_{name}': weight for name, weight in weights.items()},
+    }
 
 
 def _summary(folder: Path, provenance: dict[str, Any]) -> str:

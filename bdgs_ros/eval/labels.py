@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bdgs_ros.core.errors import EvaluationError
 from bdgs_ros.core.types import DYNAMIC_THRESHOLD, ProbabilityImage
-from bdgs_ros.eval.metric import Metric
+from bdgs_ros.eval.metric import Metric, ratio
 
 
 @dataclass(frozen=True)
@@ -33,17 +33,17 @@ class LabelScore:
     @property
     def precision(self) -> float:
         """Share of the pixels called dynamic that are; NaN if none was called."""
-        return _ratio(self.true_positives, self.true_positives + self.false_positives)
+        return ratio(self.true_positives, self.true_positives + self.false_positives)
 
     @property
     def recall(self) -> float:
         """Share of the dynamic pixels that were called so; NaN if there is none."""
-        return _ratio(self.true_positives, self.true_positives + self.false_negatives)
+        return ratio(self.true_positives, self.true_positives + self.false_negatives)
 
     @property
     def false_positive_rate(self) -> float:
         """Share of the static pixels that were called dynamic; NaN if there is none."""
-        return _ratio(self.false_positives, self.false_positives + self.true_negatives)
+        return ratio(self.false_positives, self.false_positives + self.true_negatives)
 
     def metrics(self, prefix: str = 'dynamic') -> list[Metric]:
         """Return precision, recall and false positive rate."""
@@ -52,10 +52,6 @@ class LabelScore:
             Metric(f'{prefix}_recall', self.recall),
             Metric(f'{prefix}_false_positive_rate', self.false_positive_rate),
         ]
-
-
-def _ratio(part: int, whole: int) -> float:
-    return part / whole if whole else float('nan')
 
 
 def score_labels(p_dynamic: ProbabilityImage, truth: NDArray[np.bool_]) -> LabelScore:

@@ -25,6 +25,11 @@ class Metric:
         return f'{self.name} {format_value(self.value)} {self.unit}'.rstrip()
 
 
+def ratio(part: float, whole: float) -> float:
+    """Return part over whole, NaN where there is nothing."""
+    return part / whole if whole else float('nan')
+
+
 def format_value(value: Any) -> str:
     """Write a number with four significant digits; '-' where there is none."""
     if value is None or (isinstance(value, float) and math.isnan(value)):

@@ -57,8 +57,7 @@ class GaussianMap:
     and `confirmations` are what pruning remembers (`bdgs_ros.mapping.prune`), not saved, as are
     `streak` and `violations`: keyframes in a row that measured a Gaussian where it is, or looked
     through it. `serial`, [N] int64, is a number that no other Gaussian of this map ever has or
-    had, from 0 in order of birth, by which it can be followed while others come and go; not
-    saved.
+    had, from 0 in order of birth, by which it can be followed while others come and go; not saved.
     """
 
     def __init__(self, config: BeliefConfig, degree: int = 0) -> None:

@@ -69,6 +69,8 @@ class Mapper:
     def reset(self) -> None:
         """Forget the map."""
         self.map = GaussianMap(self._belief, self._config.color.degree)
+        self.removed_by_belief = self.map.serial
+        """Serial numbers of what the last keyframe took out because it moved or never was."""
         self.keyframes: list[MapKeyframe] = []
         self.history = History()
         self.vignette = Vignette()
@@ -173,6 +175,7 @@ class Mapper:
         prune.note_checks(self.map, features)
         gone = prune.confirmed_gone(self.map, self._belief)
         gone |= prune.unconfirmed(self.map, self._count, self._config.prune)
+        self.removed_by_belief = self.map.serial[gone]
         self.map.keep(~gone)
         return np.asarray(features.agrees[~gone])
 

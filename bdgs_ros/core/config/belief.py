@@ -15,10 +15,10 @@ class LikelihoodConfig:
     w_edge: float = param(1.0, 'weight of the nearness of a mask')
     w_residual: float = param(0.0, 'weight of the signed depth residual')
     w_color: float = param(1.0, 'weight of the colour difference')
-    w_warp: float = param(1.0, 'weight of free space in remembered keyframes')
-    w_free_space: float = param(3.5, 'weight of a free-space violation')
+    w_warp: float = param(0.0, 'weight of free space in remembered keyframes')
+    w_free_space: float = param(5.0, 'weight of a free-space violation')
     w_visibility: float = param(0.0, 'weight of the share in the image')
-    w_streak: float = param(-0.5, 'weight of agreement in the keyframes before')
+    w_streak: float = param(-4.0, 'weight of agreement in the keyframes before')
     w_age: float = param(0.0, 'weight of the age')
     w_observations: float = param(0.0, 'weight of the number of observations')
     w_agreement: float = param(-0.8, 'weight of a measured depth that agrees')
@@ -38,18 +38,21 @@ class BeliefConfig:
 
     enabled: bool = param(True, 'without it labels gate the map directly (Table 6)')
     multi_view: bool = param(True, 'fuse the evidence of co-visible keyframes, Eq. 5 (Table 6)')
-    decay_rate: float = param(0.05, 'alpha of Eq. 4 and of w_k', unit='1/s', low=0.0, high=100.0)
+    decay_rate: float = param(0.7, 'alpha of Eq. 4 and of w_k', unit='1/s', low=0.0, high=100.0)
     initial: float = param(0.3, 'belief of a new Gaussian', low=0.01, high=0.99)
     initial_in_front: float = param(
         0.85, 'belief of a new Gaussian in front of the known map', low=0.01, high=0.99
     )
     margin: float = param(0.1, 'delta of Eq. 6', low=0.0, high=0.49)
-    ema: float = param(0.6, 'rho of Eq. 10', low=0.01, high=1.0)
+    ema: float = param(0.8, 'rho of Eq. 10', low=0.01, high=1.0)
     mask_threshold: float = param(0.7, 'M_g of Eq. 11: rendered below', low=0.5, high=1.0)
     mask_hysteresis: float = param(
         0.1, 'what was hidden is rendered again below the threshold by this', low=0.0, high=0.5
     )
-    max_log_odds: float = param(6.0, 'beliefs are clamped at this', low=1.0, high=50.0)
+    max_log_odds: float = param(3.0, 'the most that is known before a keyframe', low=1.0, high=50.0)
+    max_memory_log_odds: float = param(
+        3.0, 'the most that earlier keyframes say of a new Gaussian', low=0.0, high=50.0
+    )
     views: int = param(8, 'N of Eq. 5: keyframes whose evidence is kept', low=1, high=64)
     diversity_translation: float = param(0.1, 'tau_t', unit='m', low=0.0, high=10.0)
     diversity_rotation_deg: float = param(5.0, 'tau_r', unit='deg', low=0.0, high=180.0)
