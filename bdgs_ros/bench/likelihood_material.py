@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 from bdgs_ros.belief.likelihood import FEATURES, Features, Observation
 from bdgs_ros.belief.sightings import DYNAMIC, STATIC, UNKNOWN, Sightings
 from bdgs_ros.bench.sequences import synth_path
+from bdgs_ros.core import se3
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.config import BdgsConfig, specs, with_values
 from bdgs_ros.core.errors import ModelError
 from bdgs_ros.core.types import DepthImage
 from bdgs_ros.data.synth.truth import SynthTruth
-from bdgs_ros.eval.gaussian_truth import TrueState, project, true_states
+from bdgs_ros.eval.gaussian_truth import project, true_states
 from bdgs_ros.job import open_truth
 from bdgs_ros.mapping.gaussians import GaussianMap
 from bdgs_ros.mapping.witness import Shadow, Truth, Witness
@@ -32,7 +33,8 @@ SHADOW, MAP = 'shadow', 'map'
 _SHADOW_PIXELS = 600  # of each keyframe
 _SHADOW_LIFETIME = 20  # keyframes
 _MAP_SHARE = 8  # every so many-th Gaussian of the map is followed
-_STATES = {TrueState.STATIC: STATIC, TrueState.DYNAMIC: DYNAMIC, TrueState.UNKNOWN: UNKNOWN}
+_WRONG_POSE_M = 0.05
+_STATES = np.array([UNKNOWN, STATIC, DYNAMIC], np.int8)  # by `TrueState`
 
 
 @dataclass(frozen=True)
@@ -157,17 +159,34 @@ class _Overseer(Witness):
 
 
 def truth_of(truth: SynthTruth, camera: PinholeCamera) -> Truth:
-    """Return what tells the states of Gaussians; `camera` is that of the truth's images."""
+    """
+    Return what tells the states of Gaussians.
+
+    They are told at the estimated poses, which the map is made with. Where these are wrong by
+    more than `_WRONG_POSE_M`, because tracking is lost, nothing is known.
+
+    Parameters
+    ----------
+    truth : SynthTruth
+        Of the recording.
+    camera : PinholeCamera
+        Of its images.
+
+    """
+    first, *_ = poses = {p.stamp_ns: p.T_world_camera for p in truth.trajectory().poses}
+    T_world_room = se3.inverse(poses[first])
     newest: dict[int, DepthImage] = {}
 
     def states(means: Array, observation: Observation) -> NDArray[np.int8]:
         stamp_ns = observation.stamp_ns
+        T_world_camera = T_world_room @ poses[truth.nearest(stamp_ns)]
+        off_m = np.linalg.norm(observation.T_world_camera[:3, 3] - T_world_camera[:3, 3])
+        if off_m > _WRONG_POSE_M:
+            return np.full(len(means), UNKNOWN, np.int8)
         if stamp_ns not in newest:
             newest.clear()
             newest[stamp_ns] = truth.static_depth(stamp_ns)
         at = project(means, observation.T_world_camera, camera)
-        found = true_states(at, newest[stamp_ns])
-        table = np.array([_STATES[TrueState(i)] for i in range(len(TrueState))], np.int8)
-        return table[found]
+        return _STATES[true_states(at, newest[stamp_ns])]
 
     return states
