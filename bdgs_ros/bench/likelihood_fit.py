@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import product
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,9 +115,9 @@ def pool(materials: Sequence[Material], decay_rate: float, seed: int = 0) -> Poo
     )
 
 
-def bounds(without: str | None = None) -> list[Bounds]:
-    """Return the limits of all weights, with one feature left out or none."""
-    return [LEFT_OUT if n == without else SIGNS.get(n, FREE) for n in FEATURES]
+def bounds(without: Collection[str] = ()) -> list[Bounds]:
+    """Return the limits of all weights; those of features that are left out are 0."""
+    return [LEFT_OUT if n in without else SIGNS.get(n, FREE) for n in FEATURES]
 
 
 @dataclass(frozen=True)
@@ -129,9 +128,11 @@ class Settings:
     """alpha"""
     clamps: Clamps
     shrinkage: float
+    without: tuple[str, ...] = ()
+    """Features that are left out"""
 
 
-def held_out(found: Pool, limits: list[Bounds], settings: Settings) -> Array:
+def held_out(found: Pool, settings: Settings) -> Array:
     """
     Predict each seed by the weights that the others give.
 
@@ -139,10 +140,8 @@ def held_out(found: Pool, limits: list[Bounds], settings: Settings) -> Array:
     ----------
     found : Pool
         Of at least two seeds.
-    limits : list of tuple
-        See `bounds`.
     settings : Settings
-        See `logistic.fit`.
+        How to fit.
 
     Returns
     -------
@@ -153,9 +152,14 @@ def held_out(found: Pool, limits: list[Bounds], settings: Settings) -> Array:
     for seed in found.seeds:
         own = found.of('seed', seed)
         others = found.examples.choose(~own)
-        weights = logistic.fit(others, limits, settings.shrinkage, settings.clamps)
+        weights = _fit(others, settings)
         log_odds[own] = found.examples.choose(own).log_odds(weights, settings.clamps)
     return log_odds
+
+
+def _fit(examples: Examples, settings: Settings) -> Double:
+    limits = bounds(settings.without)
+    return logistic.fit(examples, limits, settings.shrinkage, settings.clamps)
 
 
 @dataclass(frozen=True)
@@ -166,20 +170,15 @@ class Trial:
     log_loss: float
 
 
-def search(
-    materials: Sequence[Material],
-    decay_rates: Sequence[float],
-    clamps: Sequence[Clamps],
-    shrinkages: Sequence[float] = SHRINKAGES,
-) -> list[Trial]:
-    """Try all combinations on held-out seeds, best first."""
+def search(materials: Sequence[Material], choices: Sequence[Settings]) -> list[Trial]:
+    """Try settings on held-out seeds, best first."""
     trials = []
-    for decay_rate in decay_rates:
+    for decay_rate in sorted({settings.decay_rate for settings in choices}):
         found = pool(materials, decay_rate)
-        for clamp, shrinkage in product(clamps, shrinkages):
-            settings = Settings(decay_rate, clamp, shrinkage)
-            log_odds = held_out(found, bounds(), settings)
-            trials.append(Trial(settings, scored(found, log_odds).log_loss))
+        for settings in choices:
+            if settings.decay_rate == decay_rate:
+                log_loss = scored(found, held_out(found, settings)).log_loss
+                trials.append(Trial(settings, log_loss))
     return sorted(trials, key=lambda trial: trial.log_loss)
 
 
@@ -198,7 +197,7 @@ class Learned:
     trials: tuple[Trial, ...]
     pool: Pool
     log_odds: dict[str, Array]
-    """Of all examples by variant: `fitted` (held out), `before`, `without FEATURE` (held out)."""
+    """Of all examples: `before`, and held out `fitted`, `without FEATURE` and `with FEATURE`."""
 
 
 def learn(
@@ -206,7 +205,7 @@ def learn(
     config: BeliefConfig,
     decay_rates: Sequence[float] = (),
     clamps: Sequence[float] = (),
-    leave_out: bool = True,
+    without: Sequence[str] = (),
 ) -> Learned:
     """
     Choose what is to be chosen, fit, and predict what was held out.
@@ -220,8 +219,8 @@ def learn(
     decay_rates, clamps : sequence of float
         To choose from: alpha, and the most that is known before a keyframe; by default those of
         `config`.
-    leave_out : bool
-        Fit also without each feature.
+    without : sequence of str
+        Features to leave out.
 
     Raises
     ------
@@ -237,17 +236,36 @@ def learn(
         )
     trials = search(
         materials,
-        decay_rates or (config.decay_rate,),
-        [Clamps(config.max_memory_log_odds, c) for c in clamps or (config.max_log_odds,)],
+        [
+            Settings(rate, Clamps(config.max_memory_log_odds, clamp), shrinkage, tuple(without))
+            for rate in decay_rates or (config.decay_rate,)
+            for clamp in clamps or (config.max_log_odds,)
+            for shrinkage in SHRINKAGES
+        ],
     )
     chosen = trials[0].settings
     found = pool(materials, chosen.decay_rate)
+    return Learned(
+        weights=_fit(found.examples, chosen),
+        settings=chosen,
+        trials=tuple(trials),
+        pool=found,
+        log_odds=_variants(found, chosen, config),
+    )
+
+
+def _variants(found: Pool, chosen: Settings, config: BeliefConfig) -> dict[str, Array]:
+    """Predict with the weights so far, with new ones, and without each of the features in use."""
     before = likelihood.weights(config.likelihood).astype(np.float64)
     variants = {
         'before': found.examples.log_odds(before, chosen.clamps),
-        'fitted': held_out(found, bounds(), chosen),
+        'fitted': held_out(found, chosen),
     }
-    for name in FEATURES if leave_out else ():
-        variants[f'without {name}'] = held_out(found, bounds(name), chosen)
-    weights = logistic.fit(found.examples, bounds(), chosen.shrinkage, chosen.clamps)
-    return Learned(weights, chosen, tuple(trials), found, variants)
+    for name in FEATURES:
+        if name in chosen.without:
+            settings = replace(chosen, without=tuple(n for n in chosen.without if n != name))
+            variants[f'with {name}'] = held_out(found, settings)
+        else:
+            settings = replace(chosen, without=(*chosen.without, name))
+            variants[f'without {name}'] = held_out(found, settings)
+    return variants

@@ -134,7 +134,9 @@ def write_report(
     for title, named in parts(learned).items():
         pages.append(f'## {title}\n\n{scorer.table(named, compared)}')
     left_out = tuple(name for name in learned.log_odds if name != 'before')
-    pages.append(f'## Each feature left out\n\n{scorer.table({"shadow": shadow}, left_out)}')
+    pages.append(
+        f'## Each feature left out, or back in\n\n{scorer.table({"shadow": shadow}, left_out)}'
+    )
     pages.append(f'## Reliability (shadow)\n\n![reliability]({_PLOT})\n')
     pages += [f'### {name}\n\n{reliability_table(curve)}' for name, curve in curves.items()]
     in_run = calibration(learned.pool.posterior[shadow], learned.pool.examples.truth[shadow])
@@ -189,6 +191,7 @@ def provenance_of(
         'priors': sorted({source.detector for source in pool.sources}),
         'examples': len(pool.examples),
         'dynamic_examples': int(np.count_nonzero(pool.examples.truth)),
+        'without': list(learned.settings.without),
         'decay_rate': learned.settings.decay_rate,
         'max_log_odds': learned.settings.clamps.known,
         'shrinkage': learned.settings.shrinkage,

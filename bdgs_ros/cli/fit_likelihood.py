@@ -71,6 +71,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='belief.max_log_odds to choose from (default: as it is)',
     )  # fmt: skip
     parser.add_argument(
+        '--without', nargs='+', metavar='FEATURE', default=[], help='features to leave out'
+    )
+    parser.add_argument(
         '--ship', action='store_true', help='make these weights the defaults of this checkout'
     )
     parser.add_argument('--date', metavar='YYYY-MM-DD', help='for --ship (default: of the commit)')
@@ -80,6 +83,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Collect, fit, and write the results."""
+    from bdgs_ros.belief.likelihood import FEATURES
     from bdgs_ros.bench import likelihood_report
     from bdgs_ros.bench.likelihood_fit import learn
     from bdgs_ros.core.files import write_text
@@ -87,8 +91,13 @@ def run(arguments: argparse.Namespace) -> int:
     from bdgs_ros.eval.provenance import commit, commit_date
 
     config = load_config(arguments)
+    _refuse_unknown('feature', arguments.without, FEATURES)
     learned = learn(
-        _materials(arguments, config), config.belief, arguments.decay_rates, arguments.clamps
+        _materials(arguments, config),
+        config.belief,
+        arguments.decay_rates,
+        arguments.clamps,
+        arguments.without,
     )
     command = 'bdgs fit-likelihood ' + _choices(arguments)
     date = arguments.date or commit_date()
@@ -120,7 +129,7 @@ def _materials(arguments: argparse.Namespace, config: BdgsConfig) -> list[Any]:
     from bdgs_ros.data.synth import scenarios
 
     names = arguments.scenarios or (_QUICK_SCENARIOS if arguments.quick else _SCENARIOS)
-    _refuse_unknown(names, tuple(scenarios()))
+    _refuse_unknown('scenario', names, tuple(scenarios()))
     frames = arguments.frames or (_QUICK_FRAMES if arguments.quick else _FRAMES)
     weights = None if arguments.no_weights else arguments.weights
     found = []
@@ -133,16 +142,16 @@ def _materials(arguments: argparse.Namespace, config: BdgsConfig) -> list[Any]:
     return found
 
 
-def _refuse_unknown(names: Sequence[str], known: Sequence[str]) -> None:
+def _refuse_unknown(kind: str, names: Sequence[str], known: Sequence[str]) -> None:
     unknown = [name for name in names if name not in known]
     if unknown:
-        raise ConfigError(f'no scenario {unknown}; there are: {", ".join(known)}')
+        raise ConfigError(f'no {kind} {unknown}; there are: {", ".join(known)}')
 
 
 def _choices(arguments: argparse.Namespace) -> str:
     """Return the arguments that decide the result, as they would be typed."""
     words = []
-    for name in ('scenarios', 'seeds', 'decay_rates', 'clamps'):
+    for name in ('scenarios', 'seeds', 'decay_rates', 'clamps', 'without'):
         values = getattr(arguments, name)
         if values and tuple(values) != _SEEDS:
             words += [f'--{name.replace("_", "-")}', *map(str, values)]
