@@ -166,7 +166,7 @@ class BeliefTracker:
         self.views.append(view)
         self.belief = self._posterior(slice(None))
         self.smoothed = bayes.smooth(self.belief, self.smoothed, self._config.ema)
-        self._mask()
+        self._mask(view.visible)
 
     def recall(self, view: View, rows: Rows, said: View) -> None:
         """
@@ -217,12 +217,17 @@ class BeliefTracker:
             visible += view.visible
         return np.asarray(free / np.maximum(visible, 1), np.float32)
 
-    def _mask(self) -> None:
-        """Apply Eq. 11; what is hidden comes back only some way below the threshold."""
+    def _mask(self, visible: Mask) -> None:
+        """
+        Apply Eq. 11 to the Gaussians that the newest keyframe saw, [N].
+
+        What is hidden comes back only some way below the threshold; what nobody sees stays as it
+        is, although its belief fades.
+        """
         config = self._config
         back = np.float32(config.mask_threshold - config.mask_hysteresis)
         limit = np.where(self.hidden, back, np.float32(config.mask_threshold))
-        self.hidden = self.smoothed >= limit
+        self.hidden = np.where(visible, self.smoothed >= limit, self.hidden)
 
     @property
     def _limit(self) -> float:

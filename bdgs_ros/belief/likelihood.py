@@ -8,11 +8,14 @@ memorises them. A Gaussian that something nearer hides gets no evidence.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from bdgs_ros.belief.surfaces import Index, find_surfaces, mean_by_group
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.config.belief import LikelihoodConfig
 from bdgs_ros.core.types import DYNAMIC_THRESHOLD, DepthImage, Pose, ProbabilityImage
@@ -22,10 +25,12 @@ Mask = NDArray[np.bool_]
 
 FEATURES = (
     'prior',
+    'object',
     'edge',
     'residual',
     'color',
     'warp',
+    'departed',
     'free_space',
     'visibility',
     'streak',
@@ -54,6 +59,19 @@ class Observation:
     depth_m: DepthImage
     p_dynamic: ProbabilityImage
 
+    @cached_property
+    def surfaces(self) -> Index:
+        """What moves together: number of the depth-connected surface, 0 for none, [H, W]."""
+        return find_surfaces(self.depth_m)
+
+    @cached_property
+    def p_object(self) -> Array:
+        """Mean P(dynamic) of the labels over each surface; the label itself off them, [H, W]."""
+        label = self.p_dynamic.ravel().astype(np.float32) / np.float32(255)
+        mean = mean_by_group(label, self.surfaces.ravel())
+        own = np.where(self.surfaces.ravel() > 0, mean, label)
+        return own.reshape(self.p_dynamic.shape).astype(np.float32)
+
 
 @dataclass(frozen=True)
 class Points:
@@ -73,6 +91,8 @@ class Points:
     """Keyframes that saw it."""
     seen_through: Array
     """Share of the remembered keyframes which looked through it."""
+    surface: Index
+    """On which surface it was last seen; 0 before."""
 
     def take(self, rows: NDArray[np.int64]) -> Points:
         """Return some of them."""
@@ -87,6 +107,8 @@ class Features:
     """[N, len(FEATURES)]; zero where not visible"""
     visible: Mask
     """[N]"""
+    surface: Index
+    """[N] number of the surface that it was seen on, 0 for none"""
 
     def column(self, name: str) -> Array:
         """Return one feature of all Gaussians, [N]."""
@@ -124,10 +146,13 @@ def extract(points: Points, observation: Observation, config: LikelihoodConfig) 
     -------
     features : Features
         Where depth agrees: `prior`, P(dynamic) of the labels at the projection (silence of the
-        detector is no evidence, since it does not know every mover); `edge`, nearness of the next
-        labelled pixel; `residual`, signed, in gates, positive where the surface is farther;
+        detector is no evidence, since it does not know every mover); `object`, the same over all
+        of its surface, so that legs leave with the person; `edge`, nearness of the next labelled
+        pixel; `residual`, signed, in gates, positive where the surface is farther;
         `color`, absolute difference over its median, saturated; `warp`, share of the remembered
-        keyframes in which this place was free (depth warp of DG-SLAM); `visibility`; `streak`;
+        keyframes in which this place was free (depth warp of DG-SLAM); `departed`, share of those
+        last seen on the same surface that are seen through now, where a thing slides over its
+        own place; `visibility`; `streak`;
         `agreement`, 1. Where seen through: `free_space`, how far beyond the gate, in gates,
         saturated. Where either: `age` and `observations`, logarithmic and saturated; `bias`, 1.
 
@@ -145,10 +170,12 @@ def extract(points: Points, observation: Observation, config: LikelihoodConfig) 
     near = points.take(index)
     on_surface: dict[str, Array | np.float32] = {
         'prior': observation.p_dynamic[row, column].astype(np.float32) / np.float32(255),
+        'object': observation.p_object[row, column],
         'edge': _rim(observation.p_dynamic)[row, column],
         'residual': residual,
         'color': _color_difference(observation.color[row, column], near.colors, agree),
         'warp': near.seen_through,
+        'departed': _departed(near.surface, seen, violation > 0),
         'visibility': near.visibility,
         'streak': np.minimum(near.streak.astype(np.float32) / _LONG_STREAK, np.float32(1)),
         'agreement': np.float32(1),
@@ -164,15 +191,29 @@ def extract(points: Points, observation: Observation, config: LikelihoodConfig) 
         block[:, FEATURES.index(name)] = np.where(agree, value, 0)
     for name, value in whenever.items():
         block[:, FEATURES.index(name)] = np.where(seen, value, 0)
-    return _scatter(len(points.means), index, block, seen)
+    surface = np.where(agree, observation.surfaces[row, column], 0)
+    count = len(points.means)
+    return Features(
+        _scatter(block, index, count),
+        _scatter(seen, index, count),
+        _scatter(surface, index, count),
+    )
 
 
-def _scatter(count: int, index: NDArray[np.int64], block: Array, seen: Mask) -> Features:
-    values = np.zeros((count, len(FEATURES)), np.float32)
-    values[index] = block
-    visible = np.zeros(count, bool)
-    visible[index] = seen
-    return Features(values, visible)
+def _scatter(part: NDArray[Any], index: NDArray[np.int64], count: int) -> NDArray[Any]:
+    """Return an array for all Gaussians, 0 but for some."""
+    whole = np.zeros((count, *part.shape[1:]), part.dtype)
+    whole[index] = part
+    return whole
+
+
+def _departed(surface: Index, seen: Mask, through: Mask) -> Array:
+    """Return which share of those seen of each one's surface is seen through, [M]."""
+    share = np.zeros(len(surface), np.float32)
+    known = seen & (surface > 0)
+    if through.any():
+        share[known] = mean_by_group(through[known].astype(np.float32), surface[known])
+    return share
 
 
 def _rim(p_dynamic: ProbabilityImage) -> Array:

@@ -32,6 +32,7 @@ _RECORDS = (
     'confirmations',
     'streak',
     'violations',
+    'surface',
     'serial',
 )
 
@@ -56,7 +57,8 @@ class GaussianMap:
     Gaussian, [N] int32; `observations` how often it was seen, [N] int32. `contribution`, `checks`
     and `confirmations` are what pruning remembers (`bdgs_ros.mapping.prune`), not saved, as are
     `streak` and `violations`: keyframes in a row that measured a Gaussian where it is, or looked
-    through it. `serial`, [N] int64, is a number that no other Gaussian of this map ever has or
+    through it; `surface`, on which depth-connected surface of which keyframe it was last seen,
+    0 before. `serial`, [N] int64, is a number that no other Gaussian of this map ever has or
     had, from 0 in order of birth, by which it can be followed while others come and go; not saved.
     """
 
@@ -79,6 +81,8 @@ class GaussianMap:
         self.confirmations = np.zeros(0, np.int32)
         self.streak = np.zeros(0, np.int32)
         self.violations = np.zeros(0, np.int32)
+        self.surface = np.zeros(0, np.int32)
+        self._surfaces = 0
         self.serial = np.zeros(0, np.int64)
         self._born = 0
 
@@ -176,6 +180,7 @@ class GaussianMap:
         self.confirmations = _join(self.confirmations, none)
         self.streak = _join(self.streak, none)
         self.violations = _join(self.violations, none)
+        self.surface = _join(self.surface, none)
         self.serial = _join(self.serial, self._new_serials(count))
 
     def _new_serials(self, count: int) -> NDArray[np.int64]:
@@ -200,6 +205,9 @@ class GaussianMap:
         agrees, through = features.agrees, features.seen_through
         self.streak = np.where(through, 0, self.streak + agrees).astype(np.int32)
         self.violations = np.where(agrees, 0, self.violations + through).astype(np.int32)
+        numbered = features.surface + self._surfaces
+        self.surface = np.where(features.surface > 0, numbered, self.surface).astype(np.int32)
+        self._surfaces += int(features.surface.max(initial=0))
 
     def keep(self, mask: NDArray[np.bool_]) -> None:
         """Drop the Gaussians where `mask`, shape (N,), is False."""
@@ -235,6 +243,7 @@ class GaussianMap:
         self.confirmations = groups.most(self.confirmations)
         self.streak = groups.least(self.streak)
         self.violations = groups.least(self.violations)
+        self.surface = self.surface[groups.leader]
         self.serial = self.serial[groups.leader]
 
     def deform(self, transforms: Mapping[int, Pose]) -> None:

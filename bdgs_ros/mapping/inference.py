@@ -88,6 +88,7 @@ class Inference:
             index - gaussians.keyframe_index,
             gaussians.observations,
             gaussians.belief.seen_through(),
+            gaussians.surface,
         )
 
     def _view(self, observation: Observation, features: Features) -> View:

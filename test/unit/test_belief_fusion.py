@@ -124,20 +124,39 @@ def test_the_graph_of_shared_views_is_kept() -> None:
     assert covisibility(both, first) == pytest.approx(0.5)
 
 
-def test_memory_speaks_about_new_gaussians_as_if_they_had_been_there() -> None:
-    """Asked later about a Gaussian, the views give the belief of one that was always there."""
-    belief = tracker()
-    views = [view(k * SECOND, float(k), array(1.0 + k, -0.5)) for k in range(3)]
+def test_memory_tells_new_gaussians_where_to_start_and_no_more() -> None:
+    """Views that all saw a place empty say together what a single sure one says."""
+    config = replace(CONFIG, decay_rate=0.0, max_memory_log_odds=2.0)
+    belief = tracker(config)
+    views = [view(k * SECOND, float(k), array(1.0, -0.5)) for k in range(3)]
     for one in views:
         belief.observe(one)
-    belief.append(array(0.5))
-    rows = np.array([2])
+    belief.append(array(0.5, 0.5))
+    rows = np.array([2, 3])
     for k, one in enumerate(views):
-        free = np.array([True])
-        belief.recall(one, rows, view(k * SECOND, float(k), array(1.0 + k), free))
+        free = np.array([True, False])
+        belief.recall(one, rows, view(k * SECOND, float(k), array(1.5, -0.1), free))
     belief.restart(rows)
-    assert belief.belief[2] == pytest.approx(belief.belief[0], abs=1e-4)
-    np.testing.assert_allclose(belief.seen_through(), [0, 0, 1])
+    np.testing.assert_allclose(bayes.logit(belief.belief[rows]), [2.0, -0.3], atol=1e-4)
+    np.testing.assert_allclose(belief.seen_through(), [0, 0, 1, 0])
+    assert belief.hidden.tolist()[2:] == [True, False]
+
+
+def test_what_is_known_is_clamped_before_the_newest_view() -> None:
+    belief = tracker(replace(CONFIG, decay_rate=0.0, max_log_odds=2.0))
+    for k in range(3):
+        belief.observe(view(k * SECOND, float(k), array(-5.0, -5.0)))
+    belief.observe(view(3 * SECOND, 3.0, array(5.0, 0.0)))
+    np.testing.assert_allclose(bayes.logit(belief.belief), [3.0, -2.0], atol=1e-3)
+
+
+def test_what_nobody_sees_stays_hidden_or_shown() -> None:
+    belief = tracker()
+    belief.observe(view(0, 0.0, array(5.0, -5.0)))
+    for k in range(1, 40):
+        belief.observe(view(k * SECOND, float(k), array(0.0, 0.0)))
+    assert belief.belief[0] < 0.6
+    assert belief.hidden.tolist() == [True, False]
 
 
 def test_hidden_gaussians_come_back_only_some_way_below_the_threshold() -> None:

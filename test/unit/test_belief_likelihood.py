@@ -12,14 +12,13 @@ CAMERA = PinholeCamera(64, 48, 60.0, 60.0, 31.5, 23.5)
 CONFIG = LikelihoodConfig()
 
 
-def points(means: np.ndarray, seen_through: float = 0.0, streak: int = 0) -> Points:
+def points(means: np.ndarray, surface: int = 0, streak: int = 0) -> Points:
     """Grey Gaussians about which little is known."""
     n = len(means)
-    count = np.full(n, streak, np.int32)
-    share = np.full(n, seen_through, np.float32)
-    grey = np.full((n, 3), 0.5, np.float32)
+    count, number = np.full(n, streak, np.int32), np.full(n, surface, np.int32)
+    grey, one = np.full((n, 3), 0.5, np.float32), np.ones(n, np.float32)
     return Points(
-        means.astype(np.float32), grey, np.ones(n, np.float32), count, count, count, share
+        means.astype(np.float32), grey, one, count, count, count, np.zeros(n, np.float32), number
     )
 
 
@@ -92,3 +91,39 @@ def test_label_without_filter_is_the_prior_where_depth_agrees() -> None:
     means = np.array([[0, 0, 2.0], [0, 0, 3.0]], np.float32)
     features = likelihood.extract(points(means), observation(prior=255), CONFIG)
     np.testing.assert_allclose(likelihood.label(features), [1.0, 0.5])
+
+
+def test_at_the_rim_of_something_nearer_nothing_counts_as_free_space() -> None:
+    seen = observation(depth=2.0)
+    seen.depth_m[:, 32:] = 1.0
+    beside = np.array([[-0.01, 0.0, 1.5]])  # projects one pixel beside the near surface
+    free = np.array([[-0.3, 0.0, 1.5]])
+    features = likelihood.extract(points(np.concatenate([beside, free])), seen, CONFIG)
+    assert features.visible.tolist() == [False, True]
+
+
+def test_a_surface_that_is_mostly_labelled_speaks_for_all_of_it() -> None:
+    seen = observation()
+    seen.p_dynamic[:, 16:] = 255
+    features = likelihood.extract(points(np.array([[-0.9, 0.0, 2.0]])), seen, CONFIG)
+    assert features.column('prior')[0] == 0
+    assert features.column('object')[0] == pytest.approx(0.75, abs=0.02)
+
+
+def test_a_surface_that_is_seen_through_elsewhere_has_departed() -> None:
+    seen = observation(depth=2.0)
+    means = np.array([[0, 0, 2.0], [0.1, 0, 1.0], [0.2, 0, 1.0]])
+    features = likelihood.extract(points(means, surface=7), seen, CONFIG)
+    assert features.column('departed')[0] == pytest.approx(2 / 3)
+    assert features.column('free_space')[1] == 1
+    alone = likelihood.extract(points(means, surface=0), seen, CONFIG)
+    assert alone.column('departed')[0] == 0
+
+
+def test_features_of_history_saturate() -> None:
+    means = np.array([[0, 0, 2.0]])
+    short, long = (
+        likelihood.extract(points(means, streak=n), observation(), CONFIG) for n in (1, 1000)
+    )
+    for name in ('streak', 'age', 'observations'):
+        assert 0 < short.column(name)[0] < long.column(name)[0] == 1

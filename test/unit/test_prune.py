@@ -30,7 +30,7 @@ def features(visible: list[bool], agree: list[bool], prior: list[float]) -> Feat
     values = np.zeros((len(visible), len(FEATURES)), np.float32)
     values[:, FEATURES.index('agreement')] = agree
     values[:, FEATURES.index('prior')] = prior
-    return Features(values, np.array(visible))
+    return Features(values, np.array(visible), np.zeros(len(visible), np.int32))
 
 
 def test_faint_and_large_gaussians_go() -> None:

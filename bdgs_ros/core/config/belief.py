@@ -12,10 +12,12 @@ class LikelihoodConfig:
     """The logistic model w, b of Eq. 3 on the features of `belief.likelihood`."""
 
     w_prior: float = param(6.0, 'weight of the detector prior')
+    w_object: float = param(0.0, 'weight of the detector prior over the surface')
     w_edge: float = param(1.0, 'weight of the nearness of a mask')
     w_residual: float = param(0.0, 'weight of the signed depth residual')
     w_color: float = param(1.0, 'weight of the colour difference')
     w_warp: float = param(0.0, 'weight of free space in remembered keyframes')
+    w_departed: float = param(2.0, 'weight of the share of the surface that is seen through')
     w_free_space: float = param(5.0, 'weight of a free-space violation')
     w_visibility: float = param(0.0, 'weight of the share in the image')
     w_streak: float = param(-4.0, 'weight of agreement in the keyframes before')
@@ -49,7 +51,9 @@ class BeliefConfig:
     mask_hysteresis: float = param(
         0.1, 'what was hidden is rendered again below the threshold by this', low=0.0, high=0.5
     )
-    max_log_odds: float = param(3.0, 'the most that is known before a keyframe', low=1.0, high=50.0)
+    max_log_odds: float = param(
+        3.0, 'the most that is known before a keyframe', low=1.0, high=50.0
+    )
     max_memory_log_odds: float = param(
         3.0, 'the most that earlier keyframes say of a new Gaussian', low=0.0, high=50.0
     )
