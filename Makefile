@@ -27,6 +27,7 @@ check: install
 
 bench: install
 	$(BIN)/bdgs bench slam
+	$(BIN)/bdgs bench belief
 	$(BIN)/bdgs bench rasterizer
 	$(BIN)/bdgs bench mapping
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
+from collections import abc
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,11 @@ from bdgs_ros.core.types import Pose, RgbdFrame
 from bdgs_ros.data.loop import LoopedSequence, LoopedTruth
 from bdgs_ros.data.sequence import Sequence
 from bdgs_ros.data.synth.truth import SynthTruth
+from bdgs_ros.eval.metric import Metric
+from bdgs_ros.eval.pictures import write_posterior
+from bdgs_ros.eval.posterior import PosteriorWatch
 from bdgs_ros.eval.scores import Truth
-from bdgs_ros.runner import LabelObserver, run_sequence, write_results
+from bdgs_ros.runner import LabelObserver, Observer, run_sequence, write_results
 
 
 @dataclass(frozen=True)
@@ -44,9 +48,28 @@ class Job:
     """Leave that map as it is."""
 
 
-def run_job(job: Job) -> dict[str, Any]:
+def run_job(
+    job: Job,
+    slam: Any = None,
+    observers: abc.Sequence[Observer] = (),
+    more: Callable[[], Iterable[Metric]] = tuple,
+) -> dict[str, Any]:
     """
     Run a recording and write its results.
+
+    Beside what `bdgs_ros.runner.write_results` writes there is `posterior.png`, what the map
+    believed at each second of the run.
+
+    Parameters
+    ----------
+    job : Job
+        What and where.
+    slam : BdgsSlam, optional
+        To run it with; a new one by default. It is left holding the final map.
+    observers : sequence of callable
+        See `bdgs_ros.runner.run_sequence`.
+    more : callable
+        Asked for further metrics after the run.
 
     Returns
     -------
@@ -64,27 +87,32 @@ def run_job(job: Job) -> dict[str, Any]:
     sequence, truth = _open(job)
     chosen = choose_frames(len(sequence), job.start, job.frames)
     labels = None if truth is None else LabelObserver(truth)
-    slam = BdgsSlam(job.config)
+    slam = BdgsSlam(job.config) if slam is None else slam
+    posterior = PosteriorWatch(slam.mapper) if job.pictures else None
     if job.map_file is not None:
         slam.start_from(job.map_file, sequence.camera, job.start_pose, localise=job.localise)
     start = time.perf_counter()
+    watching = [watch for watch in (labels, posterior) if watch is not None]
     result = run_sequence(
-        _with_progress(sequence, chosen, job.progress), slam, [] if labels is None else [labels]
+        _with_progress(sequence, chosen, job.progress), slam, [*watching, *observers]
     )
     wall_s = time.perf_counter() - start
-    return write_results(
+    metrics = write_results(
         job.output,
         result,
         slam.mapper,
         name=sequence.name,
         ground_truth=sequence.ground_truth,
         truth=truth,
-        more=[] if labels is None else labels.score.metrics(),
+        more=[*([] if labels is None else labels.score.metrics()), *more()],
         config=job.config,
         extra={'frames': [chosen.start, chosen.stop], 'wall_s': wall_s},
         keep_keyframes=job.keyframes,
         with_pictures=job.pictures,
     )
+    if posterior is not None and posterior.samples:
+        write_posterior(job.output / 'posterior.png', posterior.samples)
+    return metrics
 
 
 def _open(job: Job) -> tuple[Sequence, Truth | None]:

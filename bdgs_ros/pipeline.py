@@ -10,6 +10,7 @@ from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.config import BdgsConfig
 from bdgs_ros.core.errors import MapError
 from bdgs_ros.core.types import Keyframe, Labels, Pose, RgbdFrame, TrackingResult
+from bdgs_ros.detection.detector import Detector, LateDetector
 from bdgs_ros.detection.stage import DetectionStage
 from bdgs_ros.mapping.mapper import Mapper
 from bdgs_ros.tracking.camera_tracker import CameraTracker
@@ -26,10 +27,22 @@ class FrameResult:
 
 
 class BdgsSlam:
-    """Bayesian dynamic Gaussian-splatting SLAM, section 3 of the paper."""
+    """
+    Bayesian dynamic Gaussian-splatting SLAM, section 3 of the paper.
 
-    def __init__(self, config: BdgsConfig) -> None:
-        self.detection = DetectionStage(config.detection)
+    Parameters
+    ----------
+    config : BdgsConfig
+        All parameters.
+    detector : Detector or LateDetector, optional
+        Used instead of the one that the configuration names.
+
+    """
+
+    def __init__(
+        self, config: BdgsConfig, detector: Detector | LateDetector | None = None
+    ) -> None:
+        self.detection = DetectionStage(config.detection, detector)
         self.tracker = CameraTracker(config.tracking)
         self.mapper = Mapper(config.mapping, config.belief)
         self._map_width = config.mapping.width

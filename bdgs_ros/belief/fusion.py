@@ -105,6 +105,7 @@ class BeliefTracker:
         """[N] Eq. 10"""
         self.hidden = np.zeros(0, bool)
         """[N] where M_g of Eq. 11 is 0"""
+        self._void = np.zeros(0, bool)  # looked through when last seen
 
     def __len__(self) -> int:
         """Return the number of Gaussians."""
@@ -118,6 +119,7 @@ class BeliefTracker:
         self.smoothed = np.concatenate([self.smoothed, start])
         shown = bayes.render_mask(start, self._config.mask_threshold)
         self.hidden = np.concatenate([self.hidden, ~shown])
+        self._void = np.concatenate([self._void, np.zeros(len(initial), bool)])
         for view in self.views:
             view.append(len(initial))
 
@@ -125,6 +127,7 @@ class BeliefTracker:
         """Drop the Gaussians where `mask`, shape (N,), is False."""
         self._base, self.belief = self._base[mask], self.belief[mask]
         self.smoothed, self.hidden = self.smoothed[mask], self.hidden[mask]
+        self._void = self._void[mask]
         for view in self.views:
             view.keep(mask)
 
@@ -144,6 +147,7 @@ class BeliefTracker:
 
         self._base, self.belief = mean(self._base), mean(self.belief)
         self.smoothed, self.hidden = mean(self.smoothed), most(self.hidden)
+        self._void = most(self._void)
         for view in self.views:
             view.evidence = mean(view.evidence)
             view.visible, view.free = most(view.visible), most(view.free)
@@ -166,7 +170,7 @@ class BeliefTracker:
         self.views.append(view)
         self.belief = self._posterior(slice(None))
         self.smoothed = bayes.smooth(self.belief, self.smoothed, self._config.ema)
-        self._mask(view.visible)
+        self._mask()
 
     def recall(self, view: View, rows: Rows, said: View) -> None:
         """
@@ -217,17 +221,19 @@ class BeliefTracker:
             visible += view.visible
         return np.asarray(free / np.maximum(visible, 1), np.float32)
 
-    def _mask(self, visible: Mask) -> None:
+    def _mask(self) -> None:
         """
-        Apply Eq. 11 to the Gaussians that the newest keyframe saw, [N].
+        Apply Eq. 11; what is hidden comes back only some way below the threshold.
 
-        What is hidden comes back only some way below the threshold; what nobody sees stays as it
-        is, although its belief fades.
+        A belief that fades because nobody looks brings a Gaussian back too, but not one that was
+        looked through when it was last seen: it is a ghost until it is seen in its place.
         """
-        config = self._config
+        newest, config = self.views[-1], self._config
+        self._void = np.where(newest.visible, newest.free, self._void)
         back = np.float32(config.mask_threshold - config.mask_hysteresis)
         limit = np.where(self.hidden, back, np.float32(config.mask_threshold))
-        self.hidden = np.where(visible, self.smoothed >= limit, self.hidden)
+        ghost = self.hidden & self._void & ~newest.visible
+        self.hidden = ghost | (self.smoothed >= limit)
 
     @property
     def _limit(self) -> float:

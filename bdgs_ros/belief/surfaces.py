@@ -49,7 +49,7 @@ def find_surfaces(depth_m: DepthImage, depth_noise: float = KINECT_NOISE) -> Ind
     smooth = (far > 0) & (near - far < _STEP_SIGMA * depth_noise)
     for axis in (0, 1):
         smooth &= np.abs(_second_difference(inverse, axis)) < _CREASE_SIGMA * depth_noise
-    count, label, stats, _ = cv2.connectedComponentsWithStats(
+    _, label, stats, _ = cv2.connectedComponentsWithStats(
         smooth.astype(np.uint8), connectivity=4
     )
     large = stats[:, cv2.CC_STAT_AREA] >= _MIN_PX
@@ -92,14 +92,12 @@ def mean_by_group(values: Array, group: Index) -> Array:
     values : ndarray, shape (N,)
         Of each member.
     group : ndarray of int32, shape (N,)
-        Not negative.
+        Not negative, and not much larger than there are groups.
 
     Returns
     -------
     mean : ndarray, shape (N,)
 
     """
-    _, place = np.unique(group, return_inverse=True)
-    place = place.reshape(-1)
-    total = np.bincount(place, values)
-    return np.asarray((total / np.bincount(place))[place], np.float32)
+    total = np.bincount(group, values)
+    return np.asarray((total / np.maximum(np.bincount(group), 1))[group], np.float32)

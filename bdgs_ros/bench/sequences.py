@@ -95,6 +95,11 @@ def cell_recording(cell: Cell, options: Options) -> Path:
     return synth_path(scenario, cell.seed, cell.settings['frames'], options.work.parent)
 
 
+def prepare(cell: Cell, options: Options) -> None:
+    """Make the recording of a cell if it is not there yet."""
+    cell_recording(cell, options)
+
+
 def synth_name(scenario: str) -> str:
     """Return the sequence name of a scenario."""
     return f'{_SYNTH}{scenario}'
@@ -127,8 +132,21 @@ def cell_config(cell: Cell, options: Options) -> BdgsConfig:
         If there are no weights.
 
     """
-    values = dict(options.values)
-    if cell.configuration == 'weights':
+    return config_of(options.values, cell.configuration == 'weights', options)
+
+
+def config_of(values: Mapping[str, Any], with_weights: bool, options: Options) -> BdgsConfig:
+    """
+    Return a configuration that differs from the default by some values, with a detector or not.
+
+    Raises
+    ------
+    ModelError
+        If there are no weights.
+
+    """
+    values = dict(values)
+    if with_weights:
         path = weights_path(options)
         if not path.is_file():
             raise ModelError(f"no weights at '{path}'; give them with --weights")

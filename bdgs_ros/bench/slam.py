@@ -12,6 +12,8 @@ from bdgs_ros.bench.harness import Cell, Options
 from bdgs_ros.bench.sequences import REAL
 
 NAME = 'slam'
+PARALLEL = True
+prepare = sequences.prepare
 PROTOCOL = """
 Every colour frame with depth goes through the pipeline in order, none dropped. ATE: RMSE in cm
 over all estimated frames, nearest ground truth within 20 ms, rigid Horn alignment without scale;
@@ -72,7 +74,8 @@ def run_cell(cell: Cell, options: Options) -> dict[str, Any]:
     recording = sequences.cell_recording(cell, options)
     output = options.work / 'runs' / cell.key
     limit = sequences.frame_limit(cell)
-    metrics = run_job(Job(recording, output, config, frames=limit))['metrics']
+    job = Job(recording, output, config, frames=limit, progress=options.jobs == 1)
+    metrics = run_job(job)['metrics']
     return {column: metrics[name]['value'] for column, name in _COLUMNS.items() if name in metrics}
 
 

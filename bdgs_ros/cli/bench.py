@@ -17,7 +17,7 @@ from bdgs_ros.eval.metric import dump_json
 NAME = 'bench'
 HELP = 'measure accuracy or speed; finished cells are kept, so an interrupted bench goes on'
 
-_BENCHES = ('slam', 'mapping', 'rasterizer')
+_BENCHES = ('slam', 'belief', 'mapping', 'rasterizer')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,7 +36,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument('--force', action='store_true', help='measure again what has a result')
     parser.add_argument(
-        '--seeds', type=int, default=1, metavar='N', help='random seeds 0 to N-1 (default: 1)'
+        '--seeds',
+        type=int,
+        metavar='N',
+        help='random seeds 0 to N-1 (default: 1; 5 for belief)',
+    )
+    parser.add_argument(
+        '--jobs',
+        type=int,
+        default=1,
+        metavar='N',
+        help='benches slam and belief: cells that run at once, one thread each, without times',
     )
     parser.add_argument(
         '--data',
@@ -81,17 +91,20 @@ def run(arguments: argparse.Namespace) -> int:
     """Measure; exit code 1 if a cell failed."""
     values = parse_overrides(arguments.overrides)
     with_values(BdgsConfig(), values)  # refuse a misspelt name before anything is measured
+    bench = load(arguments.name)
+    seeds = arguments.seeds or getattr(bench, 'SEEDS', 1)
     options = Options(
         work=arguments.work / arguments.name,
         data=arguments.data,
         quick=arguments.quick,
-        seeds=tuple(range(arguments.seeds)),
+        seeds=tuple(range(seeds)),
         weights=arguments.weights,
         values=values,
         all_cells=arguments.all,
         refine_s=arguments.refine_seconds,
+        jobs=arguments.jobs,
     )
-    results = run_bench(load(arguments.name), options, arguments.only, arguments.force)
+    results = run_bench(bench, options, arguments.only, arguments.force)
     sys.stdout.write(dump_json(results) + '\n' if arguments.json else to_markdown(results))
     _report_failures(results)
     return 1 if results['failed'] else 0

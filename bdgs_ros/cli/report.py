@@ -25,6 +25,7 @@ _MEANINGS = {
     'psnr': 'rendered static map against what is known to be true, PSNR',
     'psnr_exposure_fit': 'the same after a gain and offset per channel',
     'psnr_hidden': 'the same where something moving stood before it',
+    'psnr_rest': 'the same on the rest of these images',
     'ssim': 'SSIM',
     'depth_l1': 'depth error of the rendered map, mean',
     'dynamic_precision': 'pixels called dynamic that are',
@@ -100,6 +101,10 @@ def write_page(
         ),
         Picture(folder / 'trajectory.png', 'The path, and the error of every frame.'),
         Picture(folder / 'tiles.png', 'Some frames of the animation.'),
+        Picture(
+            folder / 'posterior.png',
+            'Each second of the run: input, prior, posterior of all Gaussians, static map then.',
+        ),
     ]
     title = title or f'bdgs_ros: {metrics["sequence"]}'
     facts = {**facts, **_origin(metrics['provenance'])}

@@ -22,8 +22,8 @@ _POSE_NUMBERS = 7
 _SHOWN = (
     'frames_in', 'frames_lost', 'coverage', 'keyframes', 'ate_rmse', 'ate_final_rmse', 'ate_mean',
     'ate_std', 'ate_max', 'rpe_translation_second_rmse', 'dynamic_precision', 'dynamic_recall',
-    'dynamic_false_positive_rate', 'psnr', 'psnr_exposure_fit', 'psnr_map', 'psnr_hidden', 'ssim',
-    'depth_l1',
+    'dynamic_false_positive_rate', 'psnr', 'psnr_exposure_fit', 'psnr_map', 'psnr_hidden',
+    'psnr_rest', 'ssim', 'depth_l1',
     'gaussians', 'map_size', 'detection_median', 'tracking_median', 'tracking_p95',
     'mapping_median', 'mapping_p95', 'frame_median',
 )  # fmt: skip

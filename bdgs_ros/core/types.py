@@ -56,6 +56,8 @@ class Detection:
     class_name: str
     p_dynamic: float
     """Prior that an object of this class moves, in [0, 1]."""
+    depth_m: tuple[float, float] | None = None
+    """Between which depths it must be, for a box that was predicted and not seen."""
 
 
 @dataclass(frozen=True)

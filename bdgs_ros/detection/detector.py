@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 from bdgs_ros.core.config.detection import DetectionConfig
 from bdgs_ros.core.types import ColorImage, Detection
@@ -30,6 +31,43 @@ class Detector(Protocol):
             If the network cannot be run.
 
         """
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What was found in one image."""
+
+    stamp_ns: int
+    detections: list[Detection]
+
+
+@runtime_checkable
+class LateDetector(Protocol):
+    """A detector that may answer later than it is asked, or never."""
+
+    @property
+    def name(self) -> str:
+        """What runs and where, for people."""
+
+    def submit(self, stamp_ns: int, color: ColorImage) -> None:
+        """Offer an RGB image, shape (H, W, 3), newer than all before; never waits for long."""
+
+    def poll(self) -> list[Answer]:
+        """
+        Return what was answered since the last call, in the order of stamps.
+
+        Raises
+        ------
+        ModelError
+            If the network cannot be run.
+
+        """
+
+    def reset(self) -> None:
+        """Forget the images offered and their answers."""
+
+    def close(self) -> None:
+        """Stop working."""
 
 
 class NullDetector:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+
 from bdgs_ros.core import se3
 from bdgs_ros.core.config.detection import GeometricConfig
 from bdgs_ros.core.config.tracking import AlignConfig
@@ -37,6 +39,7 @@ _ITERATIONS = 8  # registration by depth alone takes the rest
 _MIN_INLIERS = 0.25  # fewer: the pose follows something that moves
 _MIN_COVERAGE = 0.04  # less static image compared: a pose from it is chance
 _MIN_OVERLAP = 0.8  # less of the anchor in view: the next frames get a new one
+_MAX_ACCELERATION = 30.0  # m/s^2 and rad/s^2: more, and the pose has jumped onto something else
 _MAX_MISSES = 5  # frames at constant velocity before the motion is unknown
 
 
@@ -64,7 +67,13 @@ class DirectEgoMotion:
         self._anchor: _Anchor | None = None
         self._T_odom_camera = se3.identity()
         self._misses = 0
+        self._last_ns = 0
         self._step = se3.identity()  # T_last_current of the last pair of frames
+
+    @property
+    def predicted(self) -> Pose:
+        """`T_odom_camera` of the next frame at constant velocity."""
+        return self._T_odom_camera @ self._step
 
     def update(self, frame: RgbdFrame, p_dynamic: ProbabilityImage) -> Pose | None:
         """
@@ -79,17 +88,21 @@ class DirectEgoMotion:
 
         """
         current = self._aligner.pyramid(frame.color, frame.depth_m, p_dynamic, frame.camera)
+        dt, self._last_ns = (frame.stamp_ns - self._last_ns) * 1e-9, frame.stamp_ns
         if self._anchor is None:
             self._anchor = _Anchor(frame.stamp_ns, self._T_odom_camera, current)
             return self._T_odom_camera
-        guess = self._T_odom_camera @ self._step
+        guess = self.predicted
         result = self._aligner.align(
             self._anchor.pyramid, current, se3.inverse(guess) @ self._anchor.T_odom_camera
         )
         if result.inlier_ratio < _MIN_INLIERS or result.coverage < _MIN_COVERAGE:
             return self._coast(guess)
-        self._misses = 0
         pose = self._anchor.T_odom_camera @ se3.inverse(result.T_current_reference)
+        surprise = se3.log(se3.inverse(guess) @ pose)
+        if max(map(np.linalg.norm, (surprise[:3], surprise[3:]))) > _MAX_ACCELERATION * dt**2:
+            return self._coast(guess)
+        self._misses = 0
         self._step = se3.inverse(self._T_odom_camera) @ pose
         self._T_odom_camera = se3.orthonormalise(pose)
         age_s = (frame.stamp_ns - self._anchor.stamp_ns) * 1e-9

@@ -113,12 +113,15 @@ class GeometricPrior:
         self._lags_ns = [int(config.lag * 2**k * _SECOND_NS) for k in range(config.lags)]
         self._views: deque[View] = deque()
         self._last: Mask | None = None
+        self.T_odom_camera: Pose | None = None
+        """Of the last frame; None where the motion was not known, and a new frame begins."""
 
     def reset(self) -> None:
         """Forget all earlier frames."""
         self._views.clear()
         self._ego.reset()
         self._last = None
+        self.T_odom_camera = None
 
     def process(self, frame: RgbdFrame, prior: ProbabilityImage) -> ProbabilityImage:
         """
@@ -133,7 +136,7 @@ class GeometricPrior:
 
         """
         told = self._with_last(prior)
-        T_odom_camera = self._ego.update(frame, told)
+        self.T_odom_camera = T_odom_camera = self._ego.update(frame, told)
         if T_odom_camera is None:
             self._views.clear()
             self._last = None

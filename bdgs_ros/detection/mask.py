@@ -69,11 +69,47 @@ def dynamic_prior_image(
         box = _coarse_box(detection, bins.shape, step, config.margin)
         value = round(255 * detection.p_dynamic)
         window = coarse[box[1] : box[3], box[0] : box[2]]
-        np.maximum(window, cut_box(bins, box, config) * np.uint8(value), out=window)
+        mask = cut_box(bins, box, config, detection.depth_m)
+        np.maximum(window, mask * np.uint8(value), out=window)
     return _enlarge(coarse, depth_m.shape, config.dilate)
 
 
-def cut_box(bins: Bins, box: Box, config: CutConfig) -> Mask:
+def object_depths(
+    detections: Sequence[Detection], depth_m: DepthImage, config: CutConfig
+) -> list[float | None]:
+    """
+    Return the median depth of each detection's object, metres; None where it has no depth.
+
+    Parameters
+    ----------
+    detections : sequence of Detection
+        In pixels of the depth image.
+    depth_m : ndarray, shape (H, W), float32
+        Metres, 0 where invalid.
+    config : CutConfig
+        How boxes are cut.
+
+    """
+    if not detections:
+        return []
+    step = config.stride
+    coarse_m = depth_m[step // 2 :: step, step // 2 :: step]
+    bins = depth_bins(coarse_m)
+    return [
+        _object_depth(coarse_m, bins, _coarse_box(d, bins.shape, step, 0.0), config)
+        for d in detections
+    ]
+
+
+def _object_depth(depth_m: DepthImage, bins: Bins, box: Box, config: CutConfig) -> float | None:
+    inside = depth_m[box[1] : box[3], box[0] : box[2]]
+    known = inside[(cut_box(bins, box, config) > 0) & (inside > 0)]
+    return float(np.median(known)) if known.size else None
+
+
+def cut_box(
+    bins: Bins, box: Box, config: CutConfig, between_m: tuple[float, float] | None = None
+) -> Mask:
     """
     Return which pixels of a box are the object, shape of the box.
 
@@ -85,16 +121,20 @@ def cut_box(bins: Bins, box: Box, config: CutConfig) -> Mask:
         x0 y0 x1 y1 inside the image.
     config : CutConfig
         Extent of an object in depth.
+    between_m : tuple of float, optional
+        Between which depths its middle is, where that is known before.
 
     """
     x0, y0, x1, y1 = box
     window = bins[y0:y1, x0:x1]
     holes = (window == 0).astype(np.uint8)
+    nearest, farthest = between_m or (0.0, np.inf)
     contrast = _depth_contrast(bins, box)
-    if contrast is None:
-        return np.asarray(
-            holes
-        )  # nothing in the middle has depth: very near, or seen against the sun
+    if contrast is None:  # nothing in the middle has depth: very near, or seen against the sun
+        return np.asarray(holes if nearest < config.near else np.zeros_like(holes))
+    contrast[(nearest > _BIN_DEPTH_M) | (farthest < _BIN_DEPTH_M)] = 0.0
+    if contrast.max() <= 0:  # somebody who was there is not any more
+        return np.zeros_like(holes)
     layer, peak = _depth_layer(contrast, config)
     mask = _without_specks(layer[window])
     if _BIN_DEPTH_M[peak] < config.near:

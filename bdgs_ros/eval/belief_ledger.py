@@ -51,6 +51,8 @@ class MapOwner(Protocol):
     """Whoever keeps the map; see `bdgs_ros.mapping.mapper.Mapper`."""
 
     map: Any
+    removed_by_belief: Any
+    """Serial numbers of the Gaussians that the last keyframe deleted for their belief."""
 
     def final_pose(self, stamp_ns: int, T_world_camera: Pose) -> Pose:
         """Return a pose with what mapping found out after tracking gave it."""
@@ -112,8 +114,7 @@ class BeliefLedger:
     Parameters
     ----------
     mapper : Mapper
-        Asked after each keyframe; `removed_by_belief` are the serial numbers of the Gaussians
-        that the last keyframe deleted because of their belief.
+        Asked after each keyframe.
     truth : SynthTruth
         Of the recording.
     things : collection of int
@@ -174,7 +175,7 @@ class BeliefLedger:
         gone[present] = False
         serial = np.flatnonzero(gone)
         books.alive[serial] = False
-        by_belief = np.isin(serial, getattr(self._mapper, 'removed_by_belief', ()))
+        by_belief = np.isin(serial, self._mapper.removed_by_belief)
         self._waits.deleted(serial[by_belief], serial[~by_belief])
         removed = serial[by_belief]
         states, seen = self._look(frame, pose, books.means[removed], books.tainted[removed])
@@ -232,8 +233,8 @@ class BeliefLedger:
     def _judge(self, serial: Index, called: bool) -> None:
         books = self._books
         serial = serial[books.truth[serial] != TrueState.UNKNOWN]
-        dynamic = (books.truth[serial] == TrueState.DYNAMIC).astype(int)
-        np.add.at(self._judgements, (books.is_thing[serial].astype(int), dynamic, int(called)), 1)
+        kind = 2 * books.is_thing[serial] + (books.truth[serial] == TrueState.DYNAMIC)
+        self._judgements[:, :, int(called)] += np.bincount(kind, minlength=4).reshape(2, 2)
         books.judged[serial] = True
 
     def _compare_renders(self, stamp_ns: int, pose: Pose, camera: PinholeCamera) -> None:

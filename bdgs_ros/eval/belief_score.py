@@ -60,8 +60,11 @@ class BeliefScore:
 
     @property
     def precision(self) -> float:
-        """Share of the Gaussians called dynamic that are; NaN if none was called."""
-        return ratio(self.true_positives, self.true_positives + self.false_positives)
+        """Share of the Gaussians called dynamic that are; NaN where nothing is dynamic."""
+        some = self.true_positives + self.false_negatives
+        return ratio(
+            self.true_positives, (self.true_positives + self.false_positives) * bool(some)
+        )
 
     @property
     def unknown_recall(self) -> float:

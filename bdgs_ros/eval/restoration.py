@@ -10,6 +10,7 @@ Index = NDArray[np.int64]
 
 LIMIT_S = 1.0
 _LONG_AGO_NS = -(10**18)
+_COUNTS = ('restored', 'not_restored', 'settled', 'not_settled', 'unresolved')
 
 
 class Restorations:
@@ -31,10 +32,7 @@ class Restorations:
         self._waits = np.zeros(0, bool)
         self._shown = np.zeros(0, bool)
         self._ever_shown = np.zeros(0, bool)
-        self.counts = {
-            name: 0
-            for name in ('restored', 'not_restored', 'settled', 'not_settled', 'unresolved')
-        }
+        self.counts = dict.fromkeys(_COUNTS, 0)
 
     def note(self, stamp_ns: int, serial: Index, static: Mask, seen: Mask, shown: Mask) -> None:
         """

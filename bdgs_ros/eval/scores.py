@@ -143,7 +143,8 @@ def render_metrics(views: Sequence[View], truth: Truth | None = None) -> list[Me
     Score the static map: against the true static view, or the input with moving pixels left out.
 
     Keyframes, which the map was fitted to, are left out as long as other frames remain. Where
-    truth is known, `psnr_hidden` scores only the pixels that something moving covered.
+    truth is known, `psnr_hidden` scores only the pixels that something moving covered, and
+    `psnr_rest` the others of the same views.
 
     Parameters
     ----------
@@ -216,6 +217,7 @@ _UNITS = {
     'psnr_exposure_fit': 'dB',
     'psnr_seen': 'dB',
     'psnr_hidden': 'dB',
+    'psnr_rest': 'dB',
     'psnr_map': 'dB',
     'ssim': '',
     'lpips': '',
@@ -231,7 +233,10 @@ def _against_truth(view: View, truth: Truth, perceptual: Perceptual | None) -> d
     everything = np.ones(hidden.shape, dtype=bool)
     shown = view.color, view.depth_m
     scores = _scores(view, shown, wanted, everything, perceptual)
-    return {**scores, 'psnr_hidden': rendering.psnr(view.color, wanted[0], hidden)}
+    rest = ~hidden & hidden.any()  # views in which nothing moves are in neither
+    scores['psnr_hidden'] = rendering.psnr(view.color, wanted[0], hidden)
+    scores['psnr_rest'] = rendering.psnr(view.color, wanted[0], rest)
+    return scores
 
 
 def _scores(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from typing import Any
 
 import cv2
@@ -18,7 +19,10 @@ from bdgs_ros.bridge.runner import GraphNode, run
 from bdgs_ros.bridge.worker import Worker
 from bdgs_ros.core.errors import DatasetError
 from bdgs_ros.core.types import Labels
+from bdgs_ros.detection.late import AtOnce, InBackground
 from bdgs_ros.detection.stage import DetectionStage
+
+_QUEUE = 2  # images that may wait for their labels in real time
 
 
 class DetectionNode(GraphNode):
@@ -29,16 +33,16 @@ class DetectionNode(GraphNode):
         config = parameters.declare(self, DetectionNodeConfig())
         cv2.setNumThreads(1)
         self._health = Health(self, 'detection')
-        self._stage = DetectionStage(config.detection)
+        # In real time the network has a thread of its own and the newest image, and labels come
+        # at camera rate from the object tracks; in lockstep every image is waited for.
+        runner = AtOnce if config.lockstep else partial(InBackground, nice=config.detection_nice)
+        self._stage = DetectionStage(config.detection, runner=runner)
+        self._answered_ns: int | None = None
         self._labels = self.create_publisher(Image, topics.LABELS, topics.KEPT)
         self._detections = optional.DetectionsPublisher(self)
         self._decoder = FrameDecoder.of(self)
-        # Only the newest image is worth a detector's time; in lockstep, all are.
         self._worker: Worker[RawFrame] = Worker(
-            self._on_frame,
-            self._health.error,
-            None if config.lockstep else 1,
-            nice=config.detection_nice,
+            self._on_frame, self._health.error, None if config.lockstep else _QUEUE
         )
         self._source = FrameSource(self, config, self._health, self._worker.put, self._reset)
         self.create_subscription(
@@ -59,9 +63,22 @@ class DetectionNode(GraphNode):
         except Exception as error:  # the prior is a help, not a must: nobody waits in vain
             self._health.error(error)
             labels = Labels(raw.stamp_ns, np.zeros(frame.camera.shape, np.uint8))
+        self._note_answers(raw.stamp_ns)
         weights = self._stage.status if self._stage.degraded else ''
         self._health.set_problem('detector', weights)
         self._publish(labels, raw)
+
+    def _note_answers(self, stamp_ns: int) -> None:
+        """How late the detector answers, and how often: in the time of the images."""
+        for age_s in self._stage.answer_ages_s:
+            answered_ns = stamp_ns - round(age_s * 1e9)
+            self._health.counts['detector_answers'] += 1
+            self._health.add_timing('detector_latency', age_s * 1e3)
+            if self._answered_ns is not None and answered_ns > self._answered_ns:
+                self._health.add_timing(
+                    'detector_period', (answered_ns - self._answered_ns) * 1e-6
+                )
+            self._answered_ns = answered_ns
 
     def _publish(self, labels: Labels, raw: RawFrame) -> None:
         head = conversions.header(labels.stamp_ns, raw.color.header.frame_id)
@@ -76,6 +93,7 @@ class DetectionNode(GraphNode):
     def close(self) -> None:
         """Stop working."""
         self._worker.stop()
+        self._stage.close()
 
 
 def main(args: list[str] | None = None) -> int:

@@ -4,6 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -51,6 +57,34 @@ class IsolatedBench(FakeBench):
         return {}
 
 
+class ParallelBench(FakeBench):
+    PARALLEL = True
+
+    def prepare(self, cell, options):
+        self.ran.append(cell.label)
+
+    def run_cell(self, cell, options):
+        if cell.sequence == 'b' and cell.configuration == 'y':
+            raise DatasetError('no such recording')
+        time.sleep(0.2)
+        threads = int(os.environ['OMP_NUM_THREADS'])
+        return {'process': os.getpid(), 'threads': threads, 'slow_ms': 1.0}
+
+    def summarise(self, rows):
+        return {}
+
+
+class SlowBench(ParallelBench):
+    """Leaves its process numbers in a folder and does not end by itself."""
+
+    def run_cell(self, cell, options):
+        (options.data / str(os.getpid())).touch()
+        if len(list(options.data.glob('[0-9]*'))) == 2:
+            (options.data / 'both').touch()
+        time.sleep(60)
+        return {}
+
+
 @pytest.fixture
 def options(tmp_path):
     return Options(work=tmp_path / 'work', data=tmp_path)
@@ -72,6 +106,82 @@ def test_isolated_cells_have_a_process_each_and_their_errors_arrive(options):
     done, failed = results['rows']
     assert done['process'] != os.getpid()
     assert failed['error'] == 'no such recording'
+
+
+def test_cells_at_once_have_processes_of_one_thread_and_no_times(options, monkeypatch):
+    monkeypatch.delenv('OMP_NUM_THREADS', raising=False)
+    bench = ParallelBench()
+    results = run_bench(bench, replace(options, jobs=2))
+    assert [row['configuration'] for row in results['rows']] == ['x', 'y', 'x', 'y']
+    assert results['rows'][3]['error'] == 'no such recording'
+    good = results['rows'][:3]
+    assert os.getpid() not in {row['process'] for row in good}
+    assert {row['threads'] for row in good} == {1}
+    assert all('slow_ms' not in row and row['jobs'] == 2 for row in good)
+    assert bench.ran == ['a/x/0', 'a/y/0', 'b/x/0', 'b/y/0']  # prepared one after the other
+    assert 'OMP_NUM_THREADS' not in os.environ
+    again = run_bench(bench, replace(options, jobs=2))
+    assert again['rows'][:3] == good
+
+
+def test_benches_that_measure_times_run_in_turn_whatever_is_asked_for(options):
+    bench = FakeBench()
+    run_bench(bench, replace(options, jobs=2))
+    assert len(bench.ran) == 4
+
+
+def test_one_job_keeps_the_times(options, monkeypatch):
+    monkeypatch.setenv('OMP_NUM_THREADS', '3')
+    row = run_bench(ParallelBench(), options)['rows'][0]
+    assert row['slow_ms'] == 1.0
+    assert 'jobs' not in row
+
+
+_INTERRUPTED = """
+import sys
+sys.path.insert(0, sys.argv[1])
+from pathlib import Path
+from test_bench import Options, SlowBench, run_bench
+folder = Path(sys.argv[2])
+run_bench(SlowBench(), Options(folder / 'work', folder, jobs=2))
+"""
+
+
+@pytest.mark.parametrize('how', [signal.SIGINT, signal.SIGKILL])
+def test_an_interrupted_bench_leaves_no_process_behind(tmp_path, how):
+    script = tmp_path / 'interrupted.py'
+    guarded = _INTERRUPTED.replace(
+        'run_bench(Slow', "if __name__ == '__main__':\n    run_bench(Slow"
+    )
+    script.write_text(guarded)
+    here = str(Path(__file__).parent)
+    parent = subprocess.Popen(
+        [sys.executable, str(script), here, str(tmp_path)], stderr=subprocess.DEVNULL
+    )
+    try:
+        _wait_for(lambda: (tmp_path / 'both').exists(), 60)
+        workers = [int(path.name) for path in tmp_path.glob('[0-9]*')]
+        assert len(workers) == 2
+        parent.send_signal(how)
+        assert parent.wait(20) != 0
+        _wait_for(lambda: not any(_alive(pid) for pid in workers), 20)
+    finally:
+        parent.kill()
+
+
+def _wait_for(condition, limit_s):
+    end = time.monotonic() + limit_s
+    while not condition():
+        assert time.monotonic() < end, f'not within {limit_s} s'
+        time.sleep(0.05)
+
+
+def _alive(pid):
+    try:
+        state = Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0]
+    except FileNotFoundError:
+        return False
+    return state != 'Z'
 
 
 def test_other_settings_are_other_cells(options):

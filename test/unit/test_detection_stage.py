@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from bdgs_ros.core.config.detection import DetectionConfig
 from bdgs_ros.core.errors import ModelError
 from bdgs_ros.core.types import ColorImage, Detection, RgbdFrame
 from bdgs_ros.detection.stage import DetectionStage, combine
+from bdgs_ros.detection.trouble import TroubledDetector
 
 CAMERA = PinholeCamera(320, 240, 262.0, 262.0, 159.5, 119.5)
 PERSON = Detection((100, 40, 160, 200), 0.8, 0, 'person', 0.91)
@@ -51,9 +53,10 @@ def test_labels_carry_stamp_mask_and_detections() -> None:
     stage = DetectionStage(DetectionConfig(geometric=False), Scripted())
     labels = stage.process(frame(7))
     assert labels.stamp_ns == 7 * 33_333_333
-    assert labels.detections == (PERSON,)
+    (found,) = labels.detections
+    assert found.box_xyxy == PERSON.box_xyxy and found.score == PERSON.score
     assert labels.p_dynamic.shape == CAMERA.shape and labels.p_dynamic.dtype == np.uint8
-    assert labels.p_dynamic[120, 130] == round(0.91 * 255)
+    assert labels.p_dynamic[120, 130] == round(255 * found.p_dynamic) > 128
     assert labels.p_dynamic[120, 200] == 0
     assert stage.status == 'scripted' and not stage.degraded
 
@@ -95,11 +98,94 @@ def test_no_weights_is_no_fault() -> None:
 def test_network_runs_on_every_nth_frame_only() -> None:
     """Between runs the objects are carried on."""
     detector = Scripted()
-    config = with_values(DetectionConfig(geometric=False), {'hold.interval': 3})
+    config = with_values(DetectionConfig(geometric=False), {'tracks.interval': 3})
     stage = DetectionStage(config, detector)
     for k in range(7):
         assert stage.process(frame(k)).p_dynamic[120, 130] > 128
     assert detector.calls == 3
+
+
+def moved(k: int) -> RgbdFrame:
+    """Return the frame with the person three pixels further to the right per frame."""
+    still = frame(k)
+    depth = np.full(CAMERA.shape, 3.0, np.float32)
+    depth[45:198, 105 + 3 * k : 155 + 3 * k] = 1.5
+    return replace(still, depth_m=depth)
+
+
+class Following:
+    """A detector that knows where the person of `moved` is, but not the scene."""
+
+    name = 'following'
+
+    def __init__(self) -> None:
+        self.k = 0
+
+    def detect(self, color: ColorImage) -> list[Detection]:
+        """Find the person."""
+        x = 3.0 * self.k
+        self.k += 1
+        return [Detection((100 + x, 40, 160 + x, 200), 0.8, 0, 'person', 0.91)]
+
+
+@pytest.mark.parametrize('period_s', [0.0, 0.2])
+def test_late_answers_make_masks_of_now(period_s: float) -> None:
+    """The mask lies where the person is and not where the detector saw one 0.2 s ago."""
+    detector = TroubledDetector(Following(), 0.0, 0.0, delay_s=0.2, period_s=period_s)
+    if period_s:  # it works on every seventh image: the person moves on meanwhile
+        detector._inner = Skipping(7)
+    stage = DetectionStage(DetectionConfig(geometric=False), detector)
+    for k in range(40):
+        called = stage.process(moved(k)).p_dynamic >= 128
+        if k >= 20:
+            truth = moved(k).depth_m < 2.0
+            assert called[truth].mean() > 0.9
+            assert (called & truth).sum() / called.sum() > 0.7
+    assert stage.answer_ages_s == [] or stage.answer_ages_s[0] == pytest.approx(0.2, abs=0.04)
+
+
+class Skipping(Following):
+    """The same, asked on every n-th image only."""
+
+    def __init__(self, step: int) -> None:
+        super().__init__()
+        self._step = step
+
+    def detect(self, color: ColorImage) -> list[Detection]:
+        """Find the person."""
+        found = super().detect(color)
+        self.k += self._step - 1
+        return found
+
+
+def test_dropped_detections_leave_no_gap() -> None:
+    """The person's pixels are there in every frame."""
+    stage = DetectionStage(
+        DetectionConfig(geometric=False), TroubledDetector(Scripted(), 0.3, 0, 0)
+    )
+    for k in range(60):
+        labels = stage.process(frame(k))
+        assert k < 3 or labels.p_dynamic[120, 130] > 128
+
+
+def test_detections_of_a_place_that_is_empty_now_paint_nothing() -> None:
+    """A held object that stepped out of its box leaves the wall behind it alone."""
+    stage = DetectionStage(DetectionConfig(geometric=False), OnceIn(30))
+    for k in range(30):
+        assert stage.process(frame(k)).p_dynamic.any()
+    assert not stage.process(frame(30, person=False)).p_dynamic.any()
+
+
+class OnceIn(Scripted):
+    """Sees the person in the first n images."""
+
+    def __init__(self, count: int) -> None:
+        super().__init__()
+        self._count = count
+
+    def detect(self, color: ColorImage) -> list[Detection]:
+        """Find the person, or nothing."""
+        return super().detect(color) if self.calls < self._count else []
 
 
 def test_geometric_prior_alone_sees_who_steps_in() -> None:

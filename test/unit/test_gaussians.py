@@ -6,6 +6,7 @@ from bdgs_ros.core import se3
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.config import BeliefConfig
 from bdgs_ros.mapping.gaussians import GaussianMap, NewGaussians
+from bdgs_ros.mapping.groups import Groups
 from bdgs_ros.mapping.rasterize import render
 
 CAMERA = PinholeCamera(64, 48, 60.0, 60.0, 31.5, 23.5)
@@ -48,3 +49,16 @@ def test_an_empty_map_deforms_too() -> None:
     gaussians = GaussianMap(BeliefConfig())
     gaussians.deform({0: np.eye(4)})
     assert len(gaussians) == 0
+
+
+def test_serial_numbers_are_never_given_twice() -> None:
+    gaussians = random_map(5)
+    gaussians.keep(np.array([True, False, True, True, False]))
+    gaussians.copy(np.array([0, 2]))
+    assert gaussians.serial.tolist() == [0, 2, 3, 5, 6]
+    gaussians.pool(
+        Groups(np.array([0, 1, 0, 1, 1]), np.array([2, 1]), np.ones(5, np.float32)),
+        {name: values[:2] for name, values in gaussians.parameters.items()},
+    )
+    assert gaussians.serial.tolist() == [3, 2]  # those of the heaviest members
+    assert gaussians.serial.dtype == np.int64

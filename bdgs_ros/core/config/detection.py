@@ -28,16 +28,48 @@ class CutConfig:
 
 
 @dataclass(frozen=True)
-class HoldConfig:
-    """What happens to an object that the network misses in one frame."""
+class TracksConfig:
+    """Objects followed from detection to detection: where they are while the network is mute."""
 
     interval: int = param(1, 'run the network on every n-th frame', low=1, high=30)
-    frames: int = param(4, 'frames that a missed object is held', low=0, high=60)
-    decay: float = param(0.85, 'its score, multiplied per missed frame', low=0.0, high=1.0)
-    min_score: float = param(
-        0.45, 'only objects seen at least this well are held', low=0.0, high=1.0
+    start_odds: float = param(
+        4.0, 'that a detection is a real one, in the first image', low=0.0, high=100.0
     )
-    iou: float = param(0.3, 'overlap that makes two boxes one object', low=0.0, high=1.0)
+    border_odds: float = param(
+        0.2, 'that a new detection at the border of the image is a real one', low=0.0, high=100.0
+    )
+    birth_odds: float = param(
+        0.05, 'that a new detection elsewhere is a real one', low=0.0, high=100.0
+    )
+    even_score: float = param(
+        0.2, 'the score that a false detection has as often as a true one', low=0.01, high=0.99
+    )
+    most_odds: float = param(
+        200.0, 'that an object exists, however often it was seen', low=1.0, high=1e6
+    )
+    miss_s: float = param(
+        0.1, 'missed for so long, the odds of an object fall by e', unit='s', low=0.001, high=10.0
+    )
+    miss_odds: float = param(0.3, 'the least factor of one miss', low=0.0, high=1.0)
+    longest_s: float = param(
+        1.0, 'an object not seen for longer is let go', unit='s', low=0.0, high=60.0
+    )
+    speed: float = param(
+        0.5, 'of an object, standard deviation per axis', unit='m/s', low=0.01, high=100.0
+    )
+    speed_s: float = param(
+        0.5, 'for which an object keeps its velocity', unit='s', low=0.01, high=100.0
+    )
+    size_change: float = param(0.4, 'of a size within one second', unit='m', low=0.01, high=10.0)
+    box_sigma: float = param(0.07, 'noise of a box, in parts of its size', low=0.001, high=1.0)
+    depth_sigma: float = param(0.12, "noise of an object's depth", unit='m', low=0.001, high=10.0)
+    gate_sigma: float = param(
+        4.0, 'further from its prediction an object is another one', unit='sigma', low=0.1
+    )
+    widen: float = param(
+        1.0, 'a predicted box is larger by this on each side', unit='sigma', low=0.0, high=10.0
+    )
+    gate_iou: float = param(0.3, 'unless their boxes overlap by this', low=0.0, high=1.0)
 
 
 @dataclass(frozen=True)
@@ -88,5 +120,5 @@ class DetectionConfig:
     iou_threshold: float = param(0.45, 'overlap for non-maximum suppression', low=0.0, high=1.0)
     geometric: bool = param(True, 'use the depth warp between frames as a prior')
     cut: CutConfig = field(default_factory=CutConfig)
-    hold: HoldConfig = field(default_factory=HoldConfig)
+    tracks: TracksConfig = field(default_factory=TracksConfig)
     warp: GeometricConfig = field(default_factory=GeometricConfig)
