@@ -28,7 +28,7 @@ from bdgs_ros.eval.calibration import Calibration, calibration
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-SHRINKAGES = (1e-6, 1e-5, 1e-4, 1e-3)
+SHRINKAGES = (1e-5, 1e-4, 1e-3)
 LEFT_OUT: Bounds = (0.0, 0.0)
 
 # Where more of a feature can only speak for one side, a weight of the other sign would be noise.
