@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import textwrap
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from bdgs_ros.eval.metric import dump_json, markdown_table
 Mask = NDArray[np.bool_]
 
 _DECIMALS = 3  # of a weight; the spread between seeds is larger
+_LONG = 80  # characters, beyond which a text in the module goes over several lines
 _PLOT = 'reliability.png'
 _PROTOCOL = """
 Every run is the whole pipeline on a synthetic recording. Examples are Gaussians at the keyframes
@@ -217,8 +219,19 @@ def _literal(values: Mapping[str, Any]) -> str:
     lines = []
     for key, value in values.items():
         if isinstance(value, list):
-            items = ''.join(f'        {item!r},\n' for item in value)
-            lines.append(f'    {key!r}: [\n{items}    ],\n')
+            lines.append(f'    {key!r}: [\n{_lines(value)}    ],\n')
+        elif isinstance(value, str) and len(value) > _LONG:
+            lines.append(f'    {key!r}: (\n{_lines(_pieces(value), "")}    ),\n')
         else:
             lines.append(f'    {key!r}: {value!r},\n')
     return '{\n' + ''.join(lines) + '}'
+
+
+def _lines(values: Sequence[Any], end: str = ',') -> str:
+    return ''.join(f'        {value!r}{end}\n' for value in values)
+
+
+def _pieces(text: str) -> list[str]:
+    """Cut a text behind spaces; together the pieces are the text."""
+    found = textwrap.wrap(text, _LONG)
+    return [*(f'{piece} ' for piece in found[:-1]), found[-1]]

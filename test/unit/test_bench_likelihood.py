@@ -135,11 +135,13 @@ def provenance(learned: Learned) -> dict[str, Any]:
 
 
 def test_the_module_of_defaults_is_python_with_the_same_content(learned: Learned) -> None:
-    text = as_module(rounded(learned), provenance(learned))
+    command = 'bdgs fit-likelihood' + 20 * ' --set name=value'
+    text = as_module(rounded(learned), {**provenance(learned), 'command': command})
     values: dict[str, Any] = {}
     exec(compile(ast.parse(text), 'likelihood_fit.py', 'exec'), values)
     assert values['WEIGHTS'] == rounded(learned)
     assert values['PROVENANCE']['seeds'] == [100, 101]
+    assert values['PROVENANCE']['command'] == command
     assert max(map(len, text.splitlines())) < 100
 
 

@@ -3,25 +3,60 @@
 from __future__ import annotations
 
 WEIGHTS: dict[str, float] = {
-    'prior': 6.0,
-    'object': 0.0,
-    'edge': 1.0,
+    'prior': 0.88,
+    'object': 4.909,
+    'edge': 0.0,
     'residual': 0.0,
-    'color': 1.0,
+    'color': 0.0,
     'warp': 0.0,
-    'departed': 2.0,
-    'free_space': 5.0,
+    'departed': 15.863,
+    'free_space': 12.781,
     'visibility': 0.0,
-    'streak': -4.0,
+    'streak': -0.621,
     'age': 0.0,
     'observations': 0.0,
-    'agreement': -0.8,
-    'bias': 0.2,
+    'agreement': -2.525,
+    'bias': -1.097,
 }
 
 PROVENANCE: dict[str, str | int | float | list[str] | list[int]] = {
-    'command': 'set by hand',
+    'command': (
+        'bdgs fit-likelihood --scenarios unknown_box walking_xyz chair_moved --without '
+        'age observations visibility color residual edge warp --set mapping.threads=1 '
+        '--set mapping.iterations=10'
+    ),
+    'commit': 'a525f26',
+    'date': '2026-11-22',
+    'scenarios': [
+        'chair_moved',
+        'unknown_box',
+        'walking_xyz',
+    ],
     'seeds': [
         100,
+        101,
     ],
+    'frames': [
+        300,
+    ],
+    'priors': [
+        'geometric',
+        'weights',
+    ],
+    'examples': 278709,
+    'dynamic_examples': 15050,
+    'without': [
+        'age',
+        'observations',
+        'visibility',
+        'color',
+        'residual',
+        'edge',
+        'warp',
+    ],
+    'decay_rate': 0.7,
+    'max_log_odds': 3.0,
+    'shrinkage': 1e-05,
+    'held_out_log_loss': 0.01951,
+    'held_out_brier': 0.0032,
 }
