@@ -15,6 +15,7 @@ from bdgs_ros.cli import (
     demo,
     eval,
     export,
+    fit_likelihood,
     info,
     refine,
     report,
@@ -25,7 +26,8 @@ from bdgs_ros.core.errors import BdgsError
 
 # Each has NAME, HELP, add_arguments(parser) and run(arguments) -> exit code.
 _MODULES: tuple[ModuleType, ...] = (
-    synth, convert, info, run, refine, export, eval, report, bench, config, demo,
+    synth, convert, info, run, refine, export, eval, report, bench,
+    fit_likelihood, config, demo,
 )  # fmt: skip
 
 _FAILED = 2

@@ -21,6 +21,12 @@ def commit() -> str:
     return f'{head}{"+" if changed else ""}' if head else f'version {_version("bdgs_ros")}'
 
 
+def commit_date() -> str:
+    """Return the day of the commit of this checkout, YYYY-MM-DD; empty where there is none."""
+    root = Path(__file__).resolve().parents[2]
+    return _git(root, 'show', '-s', '--format=%cs', 'HEAD') if (root / '.git').exists() else ''
+
+
 def _git(root: Path, *arguments: str) -> str:
     try:
         done = subprocess.run(

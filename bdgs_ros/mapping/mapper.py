@@ -60,7 +60,8 @@ class Mapper:
         self._config = mapping
         self._belief = belief
         self._optimiser = Optimiser(mapping)
-        self._inference = Inference(belief)
+        self.inference = Inference(belief)
+        """May be replaced by one that keeps a record."""
         self.frozen = False
         """Localisation mode: keyframes are answered with a view, the map does not change."""
         self.reset()
@@ -170,7 +171,7 @@ class Mapper:
             frame.depth_m,
             keyframe.p_dynamic,
         )
-        features = self._inference.observe(self.map, observation, self._count)
+        features = self.inference.observe(self.map, observation, self._count)
         prune.note_checks(self.map, features)
         gone = prune.confirmed_gone(self.map, self._belief)
         gone |= prune.unconfirmed(self.map, self._count, self._config.prune)
@@ -256,7 +257,7 @@ class Mapper:
             new = lift(current, level, surface, pixels, belief, config)
             self.map.append(new, config.opacity, current.index)
             rows = np.arange(len(self.map) - len(new.means), len(self.map))
-            self._inference.ask_memory(self.map, rows, current.index)
+            self.inference.ask_memory(self.map, rows, current.index)
 
         everything = self.render_everything(current.T_world_camera, level.camera)
         unknown = ~growth.explained(level.depth_m, everything, sigma, config.depth_sigma)

@@ -4,27 +4,34 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from bdgs_ros.core.config.likelihood_fit import WEIGHTS
 from bdgs_ros.core.config.param import param
 
 
 @dataclass(frozen=True)
 class LikelihoodConfig:
-    """The logistic model w, b of Eq. 3 on the features of `belief.likelihood`."""
+    """
+    The logistic model w, b of Eq. 3 on the features of `belief.likelihood`.
 
-    w_prior: float = param(1.5, 'weight of the detector prior')
-    w_object: float = param(5.0, 'weight of the detector prior over the surface')
-    w_edge: float = param(1.0, 'weight of the nearness of a mask')
-    w_residual: float = param(0.0, 'weight of the signed depth residual')
-    w_color: float = param(1.0, 'weight of the colour difference')
-    w_warp: float = param(0.0, 'weight of free space in remembered keyframes')
-    w_departed: float = param(2.0, 'weight of the share of the surface that is seen through')
-    w_free_space: float = param(5.0, 'weight of a free-space violation')
-    w_visibility: float = param(0.0, 'weight of the share in the image')
-    w_streak: float = param(-4.0, 'weight of agreement in the keyframes before')
-    w_age: float = param(0.0, 'weight of the age')
-    w_observations: float = param(0.0, 'weight of the number of observations')
-    w_agreement: float = param(-0.8, 'weight of a measured depth that agrees')
-    w_bias: float = param(0.2, 'b')
+    The weights are those that `bdgs fit-likelihood --ship` wrote down last.
+    """
+
+    w_prior: float = param(WEIGHTS['prior'], 'weight of the detector prior')
+    w_object: float = param(WEIGHTS['object'], 'weight of the detector prior over the surface')
+    w_edge: float = param(WEIGHTS['edge'], 'weight of the nearness of a mask')
+    w_residual: float = param(WEIGHTS['residual'], 'weight of the signed depth residual')
+    w_color: float = param(WEIGHTS['color'], 'weight of the colour difference')
+    w_warp: float = param(WEIGHTS['warp'], 'weight of free space in remembered keyframes')
+    w_departed: float = param(
+        WEIGHTS['departed'], 'weight of the share of the surface that is seen through'
+    )
+    w_free_space: float = param(WEIGHTS['free_space'], 'weight of a free-space violation')
+    w_visibility: float = param(WEIGHTS['visibility'], 'weight of the share in the image')
+    w_streak: float = param(WEIGHTS['streak'], 'weight of agreement in the keyframes before')
+    w_age: float = param(WEIGHTS['age'], 'weight of the age')
+    w_observations: float = param(WEIGHTS['observations'], 'weight of the number of observations')
+    w_agreement: float = param(WEIGHTS['agreement'], 'weight of a measured depth that agrees')
+    w_bias: float = param(WEIGHTS['bias'], 'b')
     depth_noise: float = param(
         0.004, 'sigma_z = depth_floor + depth_noise * z^2', unit='1/m', low=1e-5
     )

@@ -132,7 +132,7 @@ class SynthTruth:
 
     def exposure(self, stamp_ns: int) -> float:
         """Return the exposure gain of a frame relative to the first."""
-        return self._exposure[self._nearest(stamp_ns)]
+        return self._exposure[self.nearest(stamp_ns)]
 
     def trajectory(self) -> Trajectory:
         """Return T_world_camera of every frame; world is the room, z up."""
@@ -156,13 +156,14 @@ class SynthTruth:
         return tuple(_object(entry) for entry in self.description['objects'])
 
     def _image(self, kind: str, stamp_ns: int) -> NDArray[Any]:
-        path = self._folder / kind / f'{stamp_text(self._nearest(stamp_ns))}.png'
+        path = self._folder / kind / f'{stamp_text(self.nearest(stamp_ns))}.png'
         image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         if image is None:
             raise DatasetError(f"cannot read '{path}': it is missing or broken")
         return np.asarray(image)
 
-    def _nearest(self, stamp_ns: int) -> int:
+    def nearest(self, stamp_ns: int) -> int:
+        """Return the stamp of the frame at a time; `DatasetError` if there is none."""
         index = int(np.argmin(np.abs(self._stamps - stamp_ns)))
         nearest = int(self._stamps[index])
         if abs(nearest - stamp_ns) > _TOLERANCE_NS:
