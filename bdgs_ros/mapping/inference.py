@@ -71,8 +71,8 @@ class Inference:
             return
         newest = belief.views[-1]
         points = self.points(gaussians, index).take(rows)
-        for view in belief.views:
-            if view is newest or newest.shared[view.stamp_ns] > _LEAST_SHARED:
+        for view in belief.views[:-1]:  # that they are where the newest saw them is no news
+            if newest.shared[view.stamp_ns] > _LEAST_SHARED:
                 features = likelihood.extract(points, view.observation, self._config.likelihood)
                 belief.recall(view, rows, self._view(view.observation, features))
         belief.restart(rows)
