@@ -55,7 +55,6 @@ class Inference:
         Ask the remembered keyframes about Gaussians that have just come, Eq. 5.
 
         What now stands where they saw free space came there; nothing need be waited for to know.
-        The keyframe that brought them is not asked: its depth agrees by construction.
 
         Parameters
         ----------
@@ -72,8 +71,8 @@ class Inference:
             return
         newest = belief.views[-1]
         points = self.points(gaussians, index).take(rows)
-        for view in belief.views:
-            if view is not newest and newest.shared[view.stamp_ns] > _LEAST_SHARED:
+        for view in belief.views[:-1]:  # that they are where the newest saw them is no news
+            if newest.shared[view.stamp_ns] > _LEAST_SHARED:
                 features = likelihood.extract(points, view.observation, self._config.likelihood)
                 belief.recall(view, rows, self._view(view.observation, features))
         belief.restart(rows)
