@@ -192,9 +192,7 @@ class BeliefTracker:
         """
         Take what a remembered keyframe says about Gaussians that came after it.
 
-        It tells what they start from. Keyframes that all saw a place empty say one thing, that
-        something came since, so together they say no more than `config.max_memory_log_odds`, and
-        as all that is old it fades by Eq. 4.
+        It tells what they start from: call `restart` when all have been asked.
 
         Parameters
         ----------
@@ -208,12 +206,18 @@ class BeliefTracker:
         """
         assert self._stamp_ns is not None
         view.visible[rows], view.free[rows] = said.visible, said.free
-        limit = self._config.max_memory_log_odds
-        told = self._base[rows] + self._weight(view, self._stamp_ns) * said.evidence
-        self._base[rows] = np.clip(told, -limit, limit)
+        self._base[rows] += self._weight(view, self._stamp_ns) * said.evidence
 
     def restart(self, rows: Rows) -> None:
-        """Take the posterior of Gaussians that have just come as their smoothed belief."""
+        """
+        Take the posterior of Gaussians that have just come as their smoothed belief.
+
+        Keyframes that all saw a place empty say one thing, that something came since, so together
+        they say no more than `config.max_memory_log_odds`, and as all that is old it fades by
+        Eq. 4.
+        """
+        limit = self._config.max_memory_log_odds
+        self._base[rows] = np.clip(self._base[rows], -limit, limit)
         self.belief[rows] = self._posterior(rows)
         self.states[rows] = decide(self.belief[rows], self._config.margin)
         self.smoothed[rows] = self.belief[rows]

@@ -55,6 +55,7 @@ class Inference:
         Ask the remembered keyframes about Gaussians that have just come, Eq. 5.
 
         What now stands where they saw free space came there; nothing need be waited for to know.
+        The keyframe that brought them is not asked: its depth agrees by construction.
 
         Parameters
         ----------

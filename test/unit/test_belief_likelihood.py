@@ -63,10 +63,11 @@ def test_a_gaussian_that_is_seen_through_is_dynamic_whatever_the_detector_says()
         assert value > 2
 
 
-def test_another_colour_at_the_same_depth_speaks_for_motion() -> None:
-    same, _ = evidence_at(2.0, observation())
-    other, _ = evidence_at(2.0, observation(color=1.0))
-    assert other > same
+@pytest.mark.parametrize(('color', 'expected'), [(0.5, 0.0), (0.51, 0.04), (1.0, 0.2)])
+def test_another_colour_at_the_same_depth_is_a_feature(color: float, expected: float) -> None:
+    point = points(np.array([[0, 0, 2.0]]))
+    found = likelihood.extract(point, observation(color=color), CONFIG).column('color')
+    np.testing.assert_allclose(found, [expected], atol=0.17)
 
 
 @pytest.mark.parametrize('point', [(0, 0, -1.0), (0, 0, 0.01), (5, 0, 1.0), (0, -5, 1.0)])

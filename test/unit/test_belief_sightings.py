@@ -16,7 +16,7 @@ DECAY = np.exp(-0.5)  # of one second at a rate of 0.5 / s
 
 
 def two_gaussians() -> Sightings:
-    """Gaussian 0 is seen three times; 1 comes with keyframe 1, and keyframe 0 is asked about it."""
+    """Gaussian 0 is seen three times; 1 comes with keyframe 1, and 0 is asked about it."""
     return Sightings(
         names=np.array(['a', 'b']),
         stamps_ns=np.array([0, SECOND_NS, 3 * SECOND_NS]),
@@ -33,22 +33,29 @@ def two_gaussians() -> Sightings:
 
 def test_features_add_up_with_weights_by_age() -> None:
     fused = fuse(two_gaussians(), 0.5)
+    examples = fused.examples
     np.testing.assert_array_equal(fused.rows, [0, 1, 3, 5])  # asked later, unknown: no examples
-    expected = [
-        [1, 0],
-        [1 + DECAY, 0],
-        [1, 1 + DECAY],
-        [DECAY**2, DECAY**2 * (1 + DECAY) + 3],
-    ]
-    np.testing.assert_allclose(fused.examples.features, expected, rtol=1e-5)
+    # what is said at birth comes as memory, of other keyframes too
+    memory = [[1, 0], [1, 0], [1, 1 + DECAY], [1, 1 + DECAY]]
+    np.testing.assert_allclose(examples.memory, memory, rtol=1e-5)
+    np.testing.assert_allclose(examples.views, np.zeros((4, 2)), atol=1e-6)
+    np.testing.assert_allclose(examples.newest, [[0, 0], [1, 0], [0, 0], [0, 3]])
     np.testing.assert_array_equal(fused.count, [1, 2, 2, 3])
-    np.testing.assert_array_equal(fused.examples.truth, [False, False, True, True])
+    np.testing.assert_array_equal(examples.truth, [False, False, True, True])
+
+
+def test_what_was_seen_since_birth_fades() -> None:
+    seen = two_gaussians()
+    later = replace(seen, truth=np.full(6, STATIC, np.int8))
+    views = fuse(later, 0.5).examples.views
+    np.testing.assert_allclose(views[3], [DECAY**2, 0], rtol=1e-5)  # keyframe 1 at keyframe 2
 
 
 def test_the_initial_belief_fades_from_birth_on() -> None:
-    offset = fuse(two_gaussians(), 0.5).examples.offset
+    examples = fuse(two_gaussians(), 0.5).examples
     start = np.log(0.3 / 0.7)
-    np.testing.assert_allclose(offset, [start, start * DECAY, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(examples.start, [start, start, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(examples.fade, [1, DECAY, 1, DECAY**2], rtol=1e-5)
 
 
 def test_files_bring_back_what_was_saved(tmp_path: Path) -> None:

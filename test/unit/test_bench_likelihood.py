@@ -171,12 +171,12 @@ def test_names_that_are_not_known_are_refused(
 
 def test_command_on_tiny_recordings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for seed in (100, 101):
-        folder = tmp_path / 'work' / 'synth' / f'walking_xyz_{seed}_20'
-        write_recording(folder, 'walking_xyz', seed, 20, size=(160, 120), jobs=1)
+        folder = tmp_path / 'work' / 'synth' / f'walking_xyz_{seed}_12'
+        write_recording(folder, 'walking_xyz', seed, 12, size=(160, 120), jobs=1)
     arguments = [
         'fit-likelihood', '--output', str(tmp_path / 'out'), '--work', str(tmp_path / 'work'),
-        '--scenarios', 'walking_xyz', '--frames', '20', '--no-weights',
-        '--set', 'mapping.iterations=1', '--set', 'tracking.keyframe.max_interval=4',
+        '--scenarios', 'walking_xyz', '--frames', '12', '--no-weights',
+        '--set', 'mapping.iterations=1', '--set', 'tracking.keyframe.max_interval=3',
     ]  # fmt: skip
     assert main(arguments) == 0
     assert 'on held-out seeds' in capsys.readouterr().out

@@ -26,9 +26,7 @@ def scene(index: int, box: bool) -> Observation:
         depth[:, :16] = BOX_M
     color = np.full((*CAMERA.shape, 3), 0.5, np.float32)
     pose = se3.exp(np.array([0.2 * index, 0, 0, 0, 0, 0]))
-    return Observation(
-        index * 10**9, pose, CAMERA, color, depth, np.zeros(CAMERA.shape, np.uint8)
-    )
+    return Observation(index * 10**9, pose, CAMERA, color, depth, np.zeros(CAMERA.shape, np.uint8))
 
 
 def in_front(means: NDArray[np.float32], observation: Observation) -> NDArray[np.int8]:
