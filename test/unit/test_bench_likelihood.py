@@ -171,11 +171,11 @@ def test_names_that_are_not_known_are_refused(
 
 def test_command_on_tiny_recordings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for seed in (100, 101):
-        folder = tmp_path / 'work' / 'synth' / f'walking_xyz_{seed}_24'
-        write_recording(folder, 'walking_xyz', seed, 24, size=(160, 120), jobs=1)
+        folder = tmp_path / 'work' / 'synth' / f'walking_static_{seed}_16'
+        write_recording(folder, 'walking_static', seed, 16, size=(160, 120), jobs=1)
     arguments = [
         'fit-likelihood', '--output', str(tmp_path / 'out'), '--work', str(tmp_path / 'work'),
-        '--scenarios', 'walking_xyz', '--frames', '24', '--no-weights',
+        '--scenarios', 'walking_static', '--frames', '16', '--no-weights',
         '--set', 'mapping.iterations=1', '--set', 'tracking.keyframe.max_interval=3',
     ]  # fmt: skip
     assert main(arguments) == 0
