@@ -26,7 +26,7 @@ _STEP_M, _STEP_DEG = 0.06, 6.0  # between keyframes: more than tau_r, so that ea
 def watch_inference(mapper: Any) -> list[float]:
     """Return a list that gets the milliseconds that each keyframe's inference takes."""
     times_ms: list[float] = []
-    inference = mapper._inference
+    inference = mapper.inference
     observe, ask_memory = inference.observe, inference.ask_memory
 
     def timed_observe(*arguments: Any) -> Any:
