@@ -42,6 +42,9 @@ FEATURES = (
 
 _KERNEL = np.ones((3, 3), np.uint8)
 _EDGE_PX = 4.0  # beyond a mask, in which its rim fades, at the width of the keyframe
+_SAME_SURFACE_SIGMA = 15.0  # beyond, it is another surface
+_MEDIAN_OF_NORMAL = 0.6745  # of absolute values, in sigma
+_ENOUGH = 100  # Gaussians for a median
 _COLOR_FLOOR = 0.01  # of the median difference: noise of a still image
 _MOST_COLOR = 5.0  # medians
 _LONG_STREAK, _LONG_AGE, _MANY = 5, 50, 30  # keyframes at which a feature saturates
@@ -129,7 +132,8 @@ def extract(points: Points, observation: Observation, config: LikelihoodConfig) 
     """
     Compute f_t of Eq. 3 for every Gaussian.
 
-    A Gaussian is seen where the measured depth agrees with it, within `gate_sigma`, or where
+    A Gaussian is seen where the measured depth agrees with it, within `gate_sigma` (of the noise,
+    or of what the keyframe as a whole is off, if that is more), or where
     every depth around its pixel lies beyond it: at the rim of something nearer an error of a
     pixel must not pass for free space.
 
@@ -160,7 +164,11 @@ def extract(points: Points, observation: Observation, config: LikelihoodConfig) 
     index, row, column, z = _project(points.means, observation)
     depth_m = observation.depth_m
     measured = depth_m[row, column]
-    gate = config.gate_sigma * (config.depth_noise * z**2 + config.depth_floor)
+    sigma = config.depth_noise * z**2 + config.depth_floor
+    static = observation.p_dynamic[row, column] < DYNAMIC_THRESHOLD
+    error = (measured - z) / sigma
+    inflation = _inflation(error[static & (measured > 0)])
+    gate = config.gate_sigma * sigma * inflation
     residual = (measured - z) / gate
     agree = (measured > 0) & (np.abs(residual) < 1)
     # erode takes a hole, which is 0, as the nearest depth: nothing is known there
@@ -175,13 +183,13 @@ def extract(points: Points, observation: Observation, config: LikelihoodConfig) 
         'residual': residual,
         'color': _color_difference(observation.color[row, column], near.colors, agree),
         'warp': near.seen_through,
-        'departed': _departed(near.surface, seen, violation > 0),
+        'departed': _departed(near.surface, seen, violation > 0) / inflation,
         'visibility': near.visibility,
         'streak': np.minimum(near.streak.astype(np.float32) / _LONG_STREAK, np.float32(1)),
         'agreement': np.float32(1),
     }
     whenever: dict[str, Array | np.float32] = {
-        'free_space': violation,
+        'free_space': violation / inflation,
         'age': _saturating(near.age, _LONG_AGE),
         'observations': _saturating(near.observations, _MANY),
         'bias': np.float32(1),
@@ -214,6 +222,20 @@ def _departed(surface: Index, seen: Mask, through: Mask) -> Array:
     if through.any():
         share[known] = mean_by_group(through[known].astype(np.float32), surface[known])
     return share
+
+
+def _inflation(error: Array) -> np.float32:
+    """
+    Return by how much a keyframe's depth disagrees with the map beyond sigma_z, 1 or more.
+
+    In motion blur, or where the pose is off, everything is a little displaced: that is no free
+    space, and what such a keyframe says of free space counts for less. The median is of what is
+    near enough to be the same surface, so movers do not count.
+    """
+    near = np.abs(error[np.abs(error) < _SAME_SURFACE_SIGMA])
+    if len(near) < _ENOUGH:
+        return np.float32(1)
+    return np.float32(max(1.0, float(np.median(near)) / _MEDIAN_OF_NORMAL))
 
 
 def _rim(p_dynamic: ProbabilityImage) -> Array:

@@ -128,3 +128,21 @@ def test_features_of_history_saturate() -> None:
     )
     for name in ('streak', 'age', 'observations'):
         assert 0 < short.column(name)[0] < long.column(name)[0] == 1
+
+
+def test_a_keyframe_that_is_off_as_a_whole_finds_no_free_space() -> None:
+    rng = np.random.default_rng(0)
+    means = np.column_stack([rng.uniform(-0.5, 0.5, (400, 2)), np.full(400, 2.0)])
+    exact, off = (
+        likelihood.extract(points(means), observation(depth=depth), CONFIG) for depth in (2.0, 2.2)
+    )
+    assert exact.agrees.all()
+    assert off.agrees.all()
+    means[:20] = [0.1, 0.1, 1.0]  # of these nothing is left
+    gone = [
+        likelihood.extract(points(means), observation(depth=depth), CONFIG) for depth in (2.0, 2.2)
+    ]
+    sure, unsure = (features.column('free_space')[:20] for features in gone)
+    assert (sure == 1).all()
+    assert (unsure > 0).all()
+    assert (unsure < 0.5).all()
