@@ -3,29 +3,29 @@
 from __future__ import annotations
 
 WEIGHTS: dict[str, float] = {
-    'prior': 1.014,
-    'object': 3.71,
+    'prior': 0.88,
+    'object': 4.909,
     'edge': 0.0,
     'residual': 0.0,
-    'color': 1.445,
-    'warp': 2.399,
-    'departed': 10.732,
-    'free_space': 9.495,
+    'color': 0.0,
+    'warp': 0.0,
+    'departed': 15.863,
+    'free_space': 12.781,
     'visibility': 0.0,
-    'streak': 0.0,
+    'streak': -0.621,
     'age': 0.0,
     'observations': 0.0,
-    'agreement': -3.584,
-    'bias': -1.392,
+    'agreement': -2.525,
+    'bias': -1.097,
 }
 
 PROVENANCE: dict[str, str | int | float | list[str] | list[int]] = {
     'command': (
-        'bdgs fit-likelihood --scenarios unknown_box chair_moved walking_xyz --without '
-        'age observations visibility residual edge streak --set mapping.threads=1 --set '
-        'mapping.iterations=10'
+        'bdgs fit-likelihood --scenarios unknown_box walking_xyz chair_moved --without '
+        'age observations visibility color residual edge warp --set mapping.threads=1 '
+        '--set mapping.iterations=10'
     ),
-    'commit': 'ef007c1a3c4b',
+    'commit': 'a525f26',
     'date': '2026-11-22',
     'scenarios': [
         'chair_moved',
@@ -43,19 +43,20 @@ PROVENANCE: dict[str, str | int | float | list[str] | list[int]] = {
         'geometric',
         'weights',
     ],
-    'examples': 275000,
-    'dynamic_examples': 14342,
+    'examples': 278709,
+    'dynamic_examples': 15050,
     'without': [
         'age',
         'observations',
         'visibility',
+        'color',
         'residual',
         'edge',
-        'streak',
+        'warp',
     ],
     'decay_rate': 0.7,
     'max_log_odds': 3.0,
     'shrinkage': 1e-05,
-    'held_out_log_loss': 0.00936,
-    'held_out_brier': 0.0016,
+    'held_out_log_loss': 0.01951,
+    'held_out_brier': 0.0032,
 }
