@@ -117,7 +117,8 @@ class BeliefTracker:
         """[N] Eq. 6"""
         self.hidden = np.zeros(0, bool)
         """[N] where M_g of Eq. 11 is 0"""
-        self._void = np.zeros(0, bool)  # looked through when last seen
+        self.void = np.zeros(0, bool)
+        """[N] never rendered, or looked through when last seen: these do not come back unseen"""
 
     def __len__(self) -> int:
         """Return the number of Gaussians."""
@@ -133,7 +134,7 @@ class BeliefTracker:
         self.states = np.concatenate([self.states, decided])
         shown = bayes.render_mask(start, self._config.mask_threshold)
         self.hidden = np.concatenate([self.hidden, ~shown])
-        self._void = np.concatenate([self._void, np.zeros(len(initial), bool)])
+        self.void = np.concatenate([self.void, ~shown])
         for view in self.views:
             view.append(len(initial))
 
@@ -141,7 +142,7 @@ class BeliefTracker:
         """Drop the Gaussians where `mask`, shape (N,), is False."""
         self._base, self.belief = self._base[mask], self.belief[mask]
         self.smoothed, self.hidden = self.smoothed[mask], self.hidden[mask]
-        self._void, self.states = self._void[mask], self.states[mask]
+        self.void, self.states = self.void[mask], self.states[mask]
         for view in self.views:
             view.keep(mask)
 
@@ -161,7 +162,7 @@ class BeliefTracker:
 
         self._base, self.belief = mean(self._base), mean(self.belief)
         self.smoothed, self.hidden = mean(self.smoothed), most(self.hidden)
-        self._void = most(self._void)
+        self.void = most(self.void)
         self.states = decide(self.belief, self._config.margin)
         for view in self.views:
             view.evidence = mean(view.evidence)
@@ -223,6 +224,7 @@ class BeliefTracker:
         self.smoothed[rows] = self.belief[rows]
         threshold = self._config.mask_threshold
         self.hidden[rows] = ~bayes.render_mask(self.smoothed[rows], threshold)
+        self.void[rows] = self.hidden[rows]
 
     def overwrite(self, belief: Array, where: Mask) -> None:
         """Set beliefs without any filtering, for runs that switch the filter off (Table 6)."""
@@ -230,10 +232,14 @@ class BeliefTracker:
         self.states = decide(self.belief, self._config.margin)
         self.restart_smoothing(self.belief.copy())
 
-    def restart_smoothing(self, smoothed: Array) -> None:
-        """Set the smoothed beliefs, shape (N,), and hide by them alone."""
+    def restart_smoothing(
+        self, smoothed: Array, hidden: Mask | None = None, void: Mask | None = None
+    ) -> None:
+        """Set the smoothed beliefs, shape (N,), and what is hidden: by them alone if not given."""
         self.smoothed = smoothed
-        self.hidden = ~bayes.render_mask(smoothed, self._config.mask_threshold)
+        by_threshold = ~bayes.render_mask(smoothed, self._config.mask_threshold)
+        self.hidden = by_threshold if hidden is None else hidden
+        self.void = self.hidden.copy() if void is None else void
 
     def seen_through(self) -> Array:
         """Return the share of the remembered keyframes that looked through each Gaussian, [N]."""
@@ -248,13 +254,14 @@ class BeliefTracker:
         Apply Eq. 11; what is hidden comes back only some way below the threshold.
 
         A belief that fades because nobody looks brings a Gaussian back too, but not one that was
-        looked through when it was last seen: it is a ghost until it is seen in its place.
+        looked through when it was last seen, or that was never rendered: it is a ghost until it
+        is seen in its place.
         """
         newest, config = self.views[-1], self._config
-        self._void = np.where(newest.visible, newest.free, self._void)
+        self.void = np.where(newest.visible, newest.free, self.void)
         back = np.float32(config.mask_threshold - config.mask_hysteresis)
         limit = np.where(self.hidden, back, np.float32(config.mask_threshold))
-        ghost = self.hidden & self._void & ~newest.visible
+        ghost = self.hidden & self.void & ~newest.visible
         self.hidden = ghost | (self.smoothed >= limit)
 
     @property

@@ -28,15 +28,15 @@ Every frame goes through the pipeline in order, none dropped; truth is used for 
 A Gaussian is dynamic if it lies in front of everything that is static at that time (farther than
 4 cm + 1 cm/m^2 z^2), static if it lies on a static surface (within 3 cm + 0.5 cm/m^2 z^2), else
 not scored; map and camera are as estimated. It is judged once it was visible in three keyframes
-since its truth last changed, that of its birth not counted: called dynamic if it is not rendered
-or was deleted because of its belief. precision, recall: over these. unknown_recall: of those on
-the box, which no detector knows. false_removal: of the Gaussians static at the end, those not
-rendered or deleted by belief. restored: statics that had been rendered, were hidden, and are seen
-by the camera: rendered again at a keyframe within 1 s; settled: the same of statics never
-rendered before, such as what was just put down. hidden_static: share of the static pixels that
-the map knows and belief does not show. label: dynamic pixels of the labels at camera rate. psnr:
-as in bench slam; psnr_hidden: pixels that something moving covered, psnr_rest: the others of the
-same views. inference_ms: filter and multi-view update of one keyframe.
+since its truth last changed, that of its birth not counted: called dynamic if it is not rendered,
+was deleted because of its belief, or because keyframes did not confirm it. precision, recall:
+over these. unknown_recall: of those on the box, which no detector knows. false_removal: of the
+Gaussians static at the end, those not rendered or deleted by belief. restored: statics that had
+been rendered, were hidden, and are seen by the camera: rendered again at a keyframe within 1 s;
+settled: the same of statics never rendered before, such as what was just put down. hidden_static:
+share of the static pixels that the map knows and belief does not show. label: dynamic pixels of
+the labels at camera rate. psnr: as in bench slam; psnr_hidden: pixels that something moving
+covered, psnr_rest: the others of the same views. inference_ms: filter and multi-view update of one keyframe.
 """
 
 SWITCHES: dict[str, dict[str, str]] = {

@@ -68,12 +68,13 @@ class DirectEgoMotion:
         self._T_odom_camera = se3.identity()
         self._misses = 0
         self._last_ns = 0
-        self._step = se3.identity()  # T_last_current of the last pair of frames
+        self._step: Pose | None = None  # T_last_current of the last pair; None: not known yet
 
     @property
     def predicted(self) -> Pose:
         """`T_odom_camera` of the next frame at constant velocity."""
-        return self._T_odom_camera @ self._step
+        step = se3.identity() if self._step is None else self._step
+        return self._T_odom_camera @ step
 
     def update(self, frame: RgbdFrame, p_dynamic: ProbabilityImage) -> Pose | None:
         """
@@ -88,9 +89,9 @@ class DirectEgoMotion:
 
         """
         current = self._aligner.pyramid(frame.color, frame.depth_m, p_dynamic, frame.camera)
-        dt, self._last_ns = (frame.stamp_ns - self._last_ns) * 1e-9, frame.stamp_ns
         if self._anchor is None:
             self._anchor = _Anchor(frame.stamp_ns, self._T_odom_camera, current)
+            self._last_ns = frame.stamp_ns
             return self._T_odom_camera
         guess = self.predicted
         result = self._aligner.align(
@@ -99,16 +100,24 @@ class DirectEgoMotion:
         if result.inlier_ratio < _MIN_INLIERS or result.coverage < _MIN_COVERAGE:
             return self._coast(guess)
         pose = self._anchor.T_odom_camera @ se3.inverse(result.T_current_reference)
-        surprise = se3.log(se3.inverse(guess) @ pose)
-        if max(map(np.linalg.norm, (surprise[:3], surprise[3:]))) > _MAX_ACCELERATION * dt**2:
+        if self._jumps(guess, pose, (frame.stamp_ns - self._last_ns) * 1e-9):
             return self._coast(guess)
-        self._misses = 0
-        self._step = se3.inverse(self._T_odom_camera) @ pose
+        if self._misses == 0:  # else the way since the last good frame is not that of one frame
+            self._step = se3.inverse(self._T_odom_camera) @ pose
+        self._misses, self._last_ns = 0, frame.stamp_ns
         self._T_odom_camera = se3.orthonormalise(pose)
         age_s = (frame.stamp_ns - self._anchor.stamp_ns) * 1e-9
         if age_s > self._config.lag or result.overlap < _MIN_OVERLAP:
             self._anchor = _Anchor(frame.stamp_ns, self._T_odom_camera, current)
         return self._T_odom_camera
+
+    def _jumps(self, guess: Pose, pose: Pose, elapsed_s: float) -> bool:
+        """Tell whether a pose asks for too much acceleration since the last good frame."""
+        if self._step is None:
+            return False
+        surprise = se3.log(se3.inverse(guess) @ pose)
+        most = max(float(np.linalg.norm(surprise[:3])), float(np.linalg.norm(surprise[3:])))
+        return most > _MAX_ACCELERATION * elapsed_s**2
 
     def _coast(self, guess: Pose) -> Pose | None:
         """Believe the constant velocity for a few frames, then give up."""

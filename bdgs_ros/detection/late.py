@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 import threading
@@ -100,7 +101,8 @@ class InBackground:
 
     def _run(self) -> None:
         if self._nice and sys.platform.startswith('linux'):  # elsewhere it is per process
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), self._nice)
+            with contextlib.suppress(OSError):  # a wish, not a need
+                os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), self._nice)
         while (item := self._take()) is not None:
             epoch, stamp_ns, color = item
             try:

@@ -132,7 +132,8 @@ def cut_box(
     contrast = _depth_contrast(bins, box)
     if contrast is None:  # nothing in the middle has depth: very near, or seen against the sun
         return np.asarray(holes if nearest < config.near else np.zeros_like(holes))
-    contrast[(nearest > _BIN_DEPTH_M) | (farthest < _BIN_DEPTH_M)] = 0.0
+    outside = (nearest > _BIN_DEPTH_M) | (farthest < _BIN_DEPTH_M)
+    contrast[outside] = np.minimum(contrast[outside], 0.0)  # background stays background
     if contrast.max() <= 0:  # somebody who was there is not any more
         return np.zeros_like(holes)
     layer, peak = _depth_layer(contrast, config)

@@ -36,6 +36,8 @@ _RECORDS = (
     'serial',
 )
 
+_SURFACES = 1 << 16  # after so many, numbers begin again: nobody remembers the first ones
+
 
 @dataclass(frozen=True)
 class NewGaussians:
@@ -207,6 +209,7 @@ class GaussianMap:
         numbered = features.surface + self._surfaces
         self.surface = np.where(features.surface > 0, numbered, self.surface).astype(np.int32)
         self._surfaces += int(features.surface.max(initial=0))
+        self._surfaces %= _SURFACES
 
     def keep(self, mask: NDArray[np.bool_]) -> None:
         """Drop the Gaussians where `mask`, shape (N,), is False."""

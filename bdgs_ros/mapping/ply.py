@@ -32,7 +32,14 @@ STANDARD = (
     *('x', 'y', 'z', 'nx', 'ny', 'nz', 'f_dc_0', 'f_dc_1', 'f_dc_2', 'opacity'),
     *('scale_0', 'scale_1', 'scale_2', 'rot_0', 'rot_1', 'rot_2', 'rot_3'),
 )
-STATE = ('p_dynamic', 'p_dynamic_smoothed', 'keyframe_index', 'observations')
+STATE = (
+    'p_dynamic',
+    'p_dynamic_smoothed',
+    'keyframe_index',
+    'observations',
+    'hidden',
+    'void',
+)
 _OPTIONAL = ('nx', 'ny', 'nz')
 _TYPES = {
     **{'float': '<f4', 'float32': '<f4', 'double': '<f8', 'float64': '<f8'},
@@ -102,6 +109,8 @@ def _state_blocks(gaussians: GaussianMap) -> list[Block]:
         gaussians.belief.smoothed,
         gaussians.keyframe_index.astype(np.float32),
         gaussians.observations.astype(np.float32),
+        gaussians.belief.hidden.astype(np.float32),
+        gaussians.belief.void.astype(np.float32),
     )
     return [((name,), array) for name, array in zip(STATE, arrays, strict=True)]
 
@@ -199,7 +208,9 @@ def _from_columns(
     if rest:
         gaussians.parameters['harmonics'] = block(*rest)
     gaussians.resize_colors((degree_of(len(rest)) or 0) if degree is None else degree)
-    gaussians.belief.restart_smoothing(column.get('p_dynamic_smoothed', belief).copy())
+    smoothed = column.get('p_dynamic_smoothed', belief).copy()
+    flags = (column[name] > 0.5 if name in column else None for name in ('hidden', 'void'))
+    gaussians.belief.restart_smoothing(smoothed, *flags)
     zero = np.zeros(count, np.float32)
     gaussians.keyframe_index = column.get('keyframe_index', zero).astype(np.int32)
     gaussians.observations = column.get('observations', zero).astype(np.int32)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -52,6 +54,17 @@ def test_background_around_the_person_is_not_labelled() -> None:
     assert recall > 0.98 and precision > 0.8
     assert p[80, 245] == 0 and p[300, 100] == 0
     assert p[240, 300] == round(0.9 * 255)
+
+
+def test_a_known_depth_does_not_paint_the_wall_behind() -> None:
+    """A range that ends before the wall admits no more than one that ends behind it."""
+    truth = ellipse(300, 240, 60, 170)
+    depth = put(room(2.55), truth, 2.2)
+    for far in (2.5, 2.8):
+        found = replace(person(240, 70, 360, 410), depth_m=(1.6, far))
+        p = dynamic_prior_image([found], depth, CONFIG)
+        recall, precision = scores(p, truth)
+        assert recall > 0.95 and precision > 0.75, far
 
 
 def test_gap_between_legs_stays_static() -> None:

@@ -62,7 +62,7 @@ def test_truncated_file_is_named_with_numbers(tmp_path: Path) -> None:
     path = tmp_path / 'map.ply'
     save_ply(path, a_map())
     path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(MapError, match='truncated: 20 Gaussians need 1680 bytes, 1580'):
+    with pytest.raises(MapError, match='truncated: 20 Gaussians need 1840 bytes, 1740'):
         load_ply(path, CONFIG)
 
 
@@ -164,3 +164,15 @@ def test_strange_headers_are_named(tmp_path: Path, replaced: str, by: str, messa
     (tmp_path / 'x.ply').write_bytes(content.replace(replaced.encode(), by.encode(), 1))
     with pytest.raises(MapError, match=message):
         load_ply(tmp_path / 'x.ply', CONFIG)
+
+
+def test_ghosts_stay_hidden_through_a_file(tmp_path: Path) -> None:
+    """Their belief has faded below the threshold; that alone must not bring them back."""
+    gaussians = a_map()
+    gaussians.belief.restart_smoothing(
+        np.full(len(gaussians), 0.55, np.float32), np.arange(20) < 7, np.arange(20) < 5
+    )
+    save_ply(tmp_path / 'map.ply', gaussians)
+    loaded = load_ply(tmp_path / 'map.ply', BeliefConfig()).belief
+    np.testing.assert_array_equal(loaded.hidden, np.arange(20) < 7)
+    np.testing.assert_array_equal(loaded.void, np.arange(20) < 5)
