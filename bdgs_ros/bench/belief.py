@@ -36,7 +36,8 @@ been rendered, were hidden, and are seen by the camera: rendered again at a keyf
 settled: the same of statics never rendered before, such as what was just put down. hidden_static:
 share of the static pixels that the map knows and belief does not show. label: dynamic pixels of
 the labels at camera rate. psnr: as in bench slam; psnr_hidden: pixels that something moving
-covered, psnr_rest: the others of the same views. inference_ms: filter and multi-view update of one keyframe.
+covered, psnr_rest: the others of the same views. inference_ms: filter and multi-view update of
+one keyframe.
 """
 
 SWITCHES: dict[str, dict[str, str]] = {
