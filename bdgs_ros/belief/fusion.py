@@ -120,6 +120,8 @@ class BeliefTracker:
         self.void = np.zeros(0, bool)
         """[N] never rendered, or looked through when last seen: these do not come back unseen"""
 
+        self._waits = np.zeros(0, np.int32)  # keyframes that must still see a newcomer rest
+
     def __len__(self) -> int:
         """Return the number of Gaussians."""
         return len(self.belief)
@@ -135,6 +137,7 @@ class BeliefTracker:
         shown = bayes.render_mask(start, self._config.mask_threshold)
         self.hidden = np.concatenate([self.hidden, ~shown])
         self.void = np.concatenate([self.void, ~shown])
+        self._waits = np.concatenate([self._waits, self._readmission(~shown)])
         for view in self.views:
             view.append(len(initial))
 
@@ -143,6 +146,7 @@ class BeliefTracker:
         self._base, self.belief = self._base[mask], self.belief[mask]
         self.smoothed, self.hidden = self.smoothed[mask], self.hidden[mask]
         self.void, self.states = self.void[mask], self.states[mask]
+        self._waits = self._waits[mask]
         for view in self.views:
             view.keep(mask)
 
@@ -163,6 +167,7 @@ class BeliefTracker:
         self._base, self.belief = mean(self._base), mean(self.belief)
         self.smoothed, self.hidden = mean(self.smoothed), most(self.hidden)
         self.void = most(self.void)
+        self._waits = self._readmission(most(self._waits > 0))
         self.states = decide(self.belief, self._config.margin)
         for view in self.views:
             view.evidence = mean(view.evidence)
@@ -225,6 +230,7 @@ class BeliefTracker:
         threshold = self._config.mask_threshold
         self.hidden[rows] = ~bayes.render_mask(self.smoothed[rows], threshold)
         self.void[rows] = self.hidden[rows]
+        self._waits[rows] = self._readmission(self.hidden[rows])
 
     def overwrite(self, belief: Array, where: Mask) -> None:
         """Set beliefs without any filtering, for runs that switch the filter off (Table 6)."""
@@ -255,14 +261,22 @@ class BeliefTracker:
 
         A belief that fades because nobody looks brings a Gaussian back too, but not one that was
         looked through when it was last seen, or that was never rendered: it is a ghost until it
-        is seen in its place.
+        is seen in its place. What comes hidden must be seen to rest in some keyframes in a row:
+        who stands still for one of them is no furniture.
         """
         newest, config = self.views[-1], self._config
         self.void = np.where(newest.visible, newest.free, self.void)
+        rests = newest.visible & ~newest.free
+        self._waits = np.where(rests, np.maximum(self._waits - 1, 0), self._waits)
+        broken = newest.free & (self._waits > 0)
+        self._waits = np.where(broken, config.readmission, self._waits).astype(np.int32)
         back = np.float32(config.mask_threshold - config.mask_hysteresis)
         limit = np.where(self.hidden, back, np.float32(config.mask_threshold))
         ghost = self.hidden & self.void & ~newest.visible
-        self.hidden = ghost | (self.smoothed >= limit)
+        self.hidden = ghost | (self._waits > 0) | (self.smoothed >= limit)
+
+    def _readmission(self, newcomers: Mask) -> NDArray[np.int32]:
+        return np.where(newcomers, self._config.readmission, 0).astype(np.int32)
 
     @property
     def _limit(self) -> float:

@@ -172,3 +172,14 @@ def test_hidden_gaussians_come_back_only_some_way_below_the_threshold() -> None:
         step = bayes.logit(array(target, target)) - bayes.logit(belief.belief)
         belief.observe(view(k * SECOND, float(k), step))
         assert belief.hidden.tolist() == [[False, True, True, False][k]] * 2
+
+
+def test_hidden_newcomers_must_be_seen_to_rest_several_times_in_a_row() -> None:
+    config = replace(CONFIG, decay_rate=0.0, readmission=3)
+    belief = BeliefTracker(config)
+    belief.append(array(0.9, 0.2, 0.9))
+    passes = np.array([False, False, True])
+    for k, free in enumerate((~passes & passes, passes, ~passes & passes)):
+        evidence = np.where(free, 9.0, -9.0).astype(np.float32)
+        belief.observe(view(k * SECOND, float(k), evidence, free=free))
+        assert belief.hidden.tolist() == [k < 2, False, True]

@@ -58,6 +58,9 @@ class BeliefConfig:
     mask_hysteresis: float = param(
         0.1, 'what was hidden is rendered again below the threshold by this', low=0.0, high=0.5
     )
+    readmission: int = param(
+        2, 'keyframes in a row that must see a hidden newcomer rest', low=1, high=20
+    )
     max_log_odds: float = param(
         3.0, 'the most that is known before a keyframe', low=1.0, high=50.0
     )
