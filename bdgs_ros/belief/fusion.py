@@ -247,12 +247,13 @@ class BeliefTracker:
         self.hidden = by_threshold if hidden is None else hidden
         self.void = self.hidden.copy() if void is None else void
 
-    def seen_through(self) -> Array:
-        """Return the share of the remembered keyframes that looked through each Gaussian, [N]."""
-        free, visible = np.zeros(len(self), np.float32), np.zeros(len(self), np.float32)
+    def seen_through(self, rows: Rows | slice = slice(None)) -> Array:
+        """Return the share of the remembered keyframes that looked through Gaussians, [M]."""
+        visible = np.zeros_like(self.belief[rows])
+        free = np.zeros_like(visible)
         for view in self.views:
-            free += view.free
-            visible += view.visible
+            free += view.free[rows]
+            visible += view.visible[rows]
         return np.asarray(free / np.maximum(visible, 1), np.float32)
 
     def _mask(self) -> None:

@@ -21,7 +21,7 @@ from bdgs_ros.eval.calibration import (
     plot_reliability,
     reliability_table,
 )
-from bdgs_ros.eval.metric import dump_json, markdown_table
+from bdgs_ros.eval.metric import dump_json, markdown_table, ratio
 
 Mask = NDArray[np.bool_]
 
@@ -58,8 +58,8 @@ class Scorer:
         both = int(np.count_nonzero(hidden & truth))
         return {
             **self.calibration(variant, rows).row(),
-            'recall': _share(both, int(np.count_nonzero(truth))),
-            'precision': _share(both, int(np.count_nonzero(hidden))),
+            'recall': ratio(both, int(np.count_nonzero(truth))),
+            'precision': ratio(both, int(np.count_nonzero(hidden))),
         }
 
     def table(self, parts: Mapping[str, Mask], variants: tuple[str, ...]) -> str:
@@ -71,10 +71,6 @@ class Scorer:
             for variant in variants
         ]
         return markdown_table(rows)
-
-
-def _share(part: int, whole: int) -> float:
-    return part / whole if whole else float('nan')
 
 
 def parts(learned: Learned) -> dict[str, dict[str, Mask]]:

@@ -70,7 +70,7 @@ class Inference:
         if not (self._config.enabled and self._config.multi_view and len(rows) and belief.views):
             return
         newest = belief.views[-1]
-        points = self.points(gaussians, index).take(rows)
+        points = self.points(gaussians, index, rows)
         for view in belief.views[:-1]:  # that they are where the newest saw them is no news
             if newest.shared[view.stamp_ns] > _LEAST_SHARED:
                 features = likelihood.extract(points, view.observation, self._config.likelihood)
@@ -78,17 +78,17 @@ class Inference:
         belief.restart(rows)
 
     @staticmethod
-    def points(gaussians: GaussianMap, index: int) -> Points:
-        """Return what is known of the Gaussians before a keyframe."""
+    def points(gaussians: GaussianMap, index: int, rows: Rows | slice = slice(None)) -> Points:
+        """Return what is known of Gaussians before a keyframe; of all by default."""
         return Points(
-            gaussians.means,
-            gaussians.colors,
-            gaussians.contribution,
-            gaussians.streak,
-            index - gaussians.keyframe_index,
-            gaussians.observations,
-            gaussians.belief.seen_through(),
-            gaussians.surface,
+            gaussians.means[rows],
+            gaussians.colors[rows],
+            gaussians.contribution[rows],
+            gaussians.streak[rows],
+            index - gaussians.keyframe_index[rows],
+            gaussians.observations[rows],
+            gaussians.belief.seen_through(rows),
+            gaussians.surface[rows],
         )
 
     def _view(self, observation: Observation, features: Features) -> View:
