@@ -109,6 +109,19 @@ class MoversConfig:
 
 
 @dataclass(frozen=True)
+class FeatureConfig:
+    """ORB features, by which places are recognised and keyframes joined."""
+
+    count: int = param(1000, 'features of an image at most', low=50, high=10000)
+    scale: float = param(1.2, 'between levels of the pyramid', low=1.05, high=2.0)
+    levels: int = param(8, 'of the pyramid', low=1, high=16)
+    fast_threshold: int = param(12, 'weaker corners are none', unit='of 255', low=1, high=100)
+    max_dynamic: float = param(0.5, 'likelier to move: no feature', low=0.0, high=1.0)
+    max_distance: int = param(64, 'descriptors further apart differ', unit='bit', low=1, high=256)
+    ratio: float = param(0.8, 'the best match over the second best', low=0.1, high=1.0)
+
+
+@dataclass(frozen=True)
 class TrackingConfig:
     """The camera pose of every frame."""
 
@@ -127,3 +140,4 @@ class TrackingConfig:
     refine: RefineConfig = field(default_factory=RefineConfig)
     keyframe: KeyframeConfig = field(default_factory=KeyframeConfig)
     movers: MoversConfig = field(default_factory=MoversConfig)
+    features: FeatureConfig = field(default_factory=FeatureConfig)
