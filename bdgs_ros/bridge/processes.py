@@ -11,6 +11,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -19,6 +20,11 @@ from bdgs_ros.bridge.runner import PARENT_VARIABLE
 _GRACE_S = 5.0
 _FORWARDED_WITH_VALUE = ('--log-level', '--log-config-file', '--log-file-name', '--enclave', '-e')
 _REMAPS = ('-r', '--remap')
+# The terminal's ctrl-C reaches the parent alone, which passes it on. Not by a session for each:
+# Linux shares the processor evenly between sessions (autogroup), whatever their nice values are.
+_APART: dict[str, Any] = (
+    {'process_group': 0} if sys.version_info >= (3, 11) else {'start_new_session': True}
+)
 
 
 def forwarded_arguments(arguments: Sequence[str]) -> list[str]:
@@ -90,8 +96,7 @@ class Children:
         command = [sys.executable, '-m', f'bdgs_ros.nodes.{name}', '--ros-args']
         command += ['--params-file', str(file), *self.ros_arguments]
         environment = {**os.environ, PARENT_VARIABLE: str(os.getpid())}
-        # A session of its own: the terminal's ctrl-C reaches the parent alone, which passes it on.
-        child.process = subprocess.Popen(command, env=environment, start_new_session=True)
+        child.process = subprocess.Popen(command, env=environment, **_APART)
 
     def ended(self) -> list[tuple[Child, int]]:
         """Return the children that have ended since the last call, with their exit status."""
