@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
+from bdgs_ros.bridge.cdr_image import CdrImage
 from bdgs_ros.core import se3
 from bdgs_ros.core.errors import DatasetError
 from bdgs_ros.core.types import ColorImage, DepthImage, Pose, ProbabilityImage
@@ -95,7 +96,7 @@ def _image(array: NDArray[Any], encoding: str, head: Header) -> Image:
     return message
 
 
-def probability_from_message(message: Image, topic: str) -> ProbabilityImage:
+def probability_from_message(message: Image | CdrImage, topic: str) -> ProbabilityImage:
     """
     Decode a mono8 image of P(dynamic) x 255.
 

@@ -9,6 +9,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import Image
 
 from bdgs_ros.bridge import conversions, topics
+from bdgs_ros.bridge.cdr_image import CdrImage, image_from_cdr
 from bdgs_ros.bridge.health import Health
 from bdgs_ros.bridge.model_view import ModelMessages, ModelSubscription, decode_model
 from bdgs_ros.bridge.node_config import TrackingNodeConfig
@@ -49,19 +50,18 @@ class Feedback:
         self._node = node
         self._config = config
         self._health = health
-        self._labels: StampBuffer[Image] = StampBuffer(_LABELS_KEPT)
+        self._labels: StampBuffer[CdrImage] = StampBuffer(_LABELS_KEPT)
         self._models: StampBuffer[tuple[int, ModelMessages]] = StampBuffer(_MODELS_KEPT)
         self._heard: set[str] = set()
         self._keyframes: OrderedDict[int, PinholeCamera] = OrderedDict()
-        node.create_subscription(
-            Image,
-            topics.LABELS,
-            lambda message: self._labels.put(conversions.stamp_ns(message), message),
-            topics.KEPT,
-        )
+        node.create_subscription(Image, topics.LABELS, self._keep_labels, topics.KEPT, raw=True)
         self._subscription = ModelSubscription(
             node, lambda stamp_ns, found: self._models.put(stamp_ns, (stamp_ns, found))
         )
+
+    def _keep_labels(self, message: bytes) -> None:
+        image = image_from_cdr(message)
+        self._labels.put(conversions.stamp_ns(image), image)
 
     def labels(self, frame: RgbdFrame) -> Labels | None:
         """Return the labels of a frame, in real time of the newest frame that has any."""
@@ -82,7 +82,7 @@ class Feedback:
             return None
         return Labels(conversions.stamp_ns(message), p_dynamic)
 
-    def _find_labels(self, stamp_ns: int) -> Image | None:
+    def _find_labels(self, stamp_ns: int) -> CdrImage | None:
         if self._config.lockstep:
             return self._wait(self._labels, stamp_ns, topics.LABELS)
         max_age_ns = seconds_to_ns(self._config.labels_max_age_s)

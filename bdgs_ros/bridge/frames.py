@@ -15,6 +15,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image
 
 from bdgs_ros.bridge import conversions, topics
+from bdgs_ros.bridge.cdr_image import CdrImage, image_from_cdr
 from bdgs_ros.bridge.health import Health
 from bdgs_ros.bridge.node_config import GraphConfig
 from bdgs_ros.bridge.synchroniser import Patience, Synchroniser
@@ -35,8 +36,8 @@ class RawFrame:
     """A colour message with its depth and the camera that made them, not decoded yet."""
 
     stamp_ns: int
-    color: Image
-    depth: Image
+    color: CdrImage
+    depth: CdrImage
     info: CameraInfo
     received_s: float
     """When the later of the two arrived, monotonic clock."""
@@ -73,8 +74,8 @@ class FrameSource:
         self._health = health
         self._on_frame = on_frame
         self._info: CameraInfo | None = None
-        self._held: deque[tuple[Image, Image]] = deque(maxlen=_HELD_FOR_INFO)
-        self._sync: Synchroniser[Image, Image] = Synchroniser(
+        self._held: deque[tuple[CdrImage, CdrImage]] = deque(maxlen=_HELD_FOR_INFO)
+        self._sync: Synchroniser[CdrImage, CdrImage] = Synchroniser(
             seconds_to_ns(config.sync.tolerance_s),
             seconds_to_ns(config.sync.jump_back_s),
             Patience.EAGER if config.lockstep else Patience.PREDICT,
@@ -110,7 +111,9 @@ class FrameSource:
                 ),
                 message_lost=lambda event: self._on_lost(event.total_count_change),
             )
-            self._node.create_subscription(kind, topic, callback, qos, event_callbacks=events)
+            self._node.create_subscription(
+                kind, topic, callback, qos, event_callbacks=events, raw=kind is Image
+            )
 
     def _on_incompatible(self, name: str, policy: object) -> None:
         self._health.set_problem(
@@ -128,15 +131,17 @@ class FrameSource:
         while self._held:
             self._emit([self._held.popleft()])
 
-    def _on_color(self, message: Image) -> None:
+    def _on_color(self, message: bytes) -> None:
         self._watchdog.note(self._names[topics.COLOR], time.monotonic())
-        self._emit(self._sync.add_left(conversions.stamp_ns(message), message))
+        image = image_from_cdr(message)
+        self._emit(self._sync.add_left(conversions.stamp_ns(image), image))
 
-    def _on_depth(self, message: Image) -> None:
+    def _on_depth(self, message: bytes) -> None:
         self._watchdog.note(self._names[topics.DEPTH], time.monotonic())
-        self._emit(self._sync.add_right(conversions.stamp_ns(message), message))
+        image = image_from_cdr(message)
+        self._emit(self._sync.add_right(conversions.stamp_ns(image), image))
 
-    def _emit(self, pairs: list[tuple[Image, Image]]) -> None:
+    def _emit(self, pairs: list[tuple[CdrImage, CdrImage]]) -> None:
         for color, depth in pairs:
             if self._info is None:
                 self._held.append((color, depth))
@@ -230,7 +235,7 @@ class FrameDecoder:
             self._rectifier = (camera, Rectifier(camera))
         return self._rectifier[1]
 
-    def _check_size(self, what: str, topic: str, image: Image, camera: PinholeCamera) -> None:
+    def _check_size(self, what: str, topic: str, image: CdrImage, camera: PinholeCamera) -> None:
         if (image.width, image.height) != (camera.width, camera.height):
             raise DatasetError(
                 f"topic '{topic}': expected a {what} of {camera.width}x{camera.height} as "

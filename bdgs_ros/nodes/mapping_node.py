@@ -17,6 +17,7 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Empty
 
 from bdgs_ros.bridge import conversions, parameters, topics
+from bdgs_ros.bridge.cdr_image import CdrImage, image_from_cdr
 from bdgs_ros.bridge.frames import FrameDecoder, FrameSource, RawFrame
 from bdgs_ros.bridge.health import Health
 from bdgs_ros.bridge.map_output import MapOutput, Viewpoint
@@ -51,7 +52,7 @@ class MappingNode(GraphNode):
         self._version = 0
         self._saved = (0, time.monotonic())
         self._frames: StampBuffer[RawFrame] = StampBuffer(config.frame_buffer)
-        self._labels: StampBuffer[Image] = StampBuffer(_LABELS_KEPT)
+        self._labels: StampBuffer[CdrImage] = StampBuffer(_LABELS_KEPT)
         self._decoder = FrameDecoder.of(self)
         self._models = ModelPublisher(self, self._config.map_frame)
         self._output = MapOutput(self, config)
@@ -74,12 +75,7 @@ class MappingNode(GraphNode):
         self._source = FrameSource(
             self, self._config, self._health, self._keep_frame, self._forget
         )
-        self.create_subscription(
-            Image,
-            topics.LABELS,
-            lambda message: self._labels.put(conversions.stamp_ns(message), message),
-            topics.KEPT,
-        )
+        self.create_subscription(Image, topics.LABELS, self._keep_labels, topics.KEPT, raw=True)
         self.create_subscription(
             PoseStamped, topics.KEYFRAME, self._queue_keyframe, topics.RELIABLE
         )
@@ -97,6 +93,10 @@ class MappingNode(GraphNode):
 
     def _keep_frame(self, raw: RawFrame) -> None:
         self._frames.put(raw.stamp_ns, raw)
+
+    def _keep_labels(self, message: bytes) -> None:
+        image = image_from_cdr(message)
+        self._labels.put(conversions.stamp_ns(image), image)
 
     def _keep_pose(self, message: PoseStamped) -> None:
         self._pose = message
