@@ -5,10 +5,9 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Mapping, Sequence
 
-from rclpy.executors import MultiThreadedExecutor
 from rclpy.parameter import Parameter
 
-from bdgs_ros.bridge.runner import GraphNode
+from bdgs_ros.bridge.runner import GraphNode, make_executor
 
 _SPIN_S = 0.1
 _GRACE_S = 2.0
@@ -44,7 +43,7 @@ class InProcessNodes:
         thread.start()
 
     def _spin(self, node: GraphNode) -> None:
-        executor = MultiThreadedExecutor(2)
+        executor = make_executor()
         executor.add_node(node)
         while not self._stopping:
             executor.spin_once(timeout_sec=_SPIN_S)

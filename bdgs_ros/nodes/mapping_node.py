@@ -11,8 +11,6 @@ from typing import Any
 import cv2
 import numpy as np
 from geometry_msgs.msg import PoseStamped
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.executors import MultiThreadedExecutor
 from sensor_msgs.msg import Image
 from std_msgs.msg import Empty
 
@@ -24,7 +22,7 @@ from bdgs_ros.bridge.map_output import MapOutput, Viewpoint
 from bdgs_ros.bridge.model_view import ModelPublisher
 from bdgs_ros.bridge.node_config import MappingNodeConfig
 from bdgs_ros.bridge.runner import GraphNode, run
-from bdgs_ros.bridge.services import serve_switch, serve_trigger
+from bdgs_ros.bridge.services import SideNode
 from bdgs_ros.bridge.stamped import StampBuffer
 from bdgs_ros.bridge.worker import Worker
 from bdgs_ros.core.errors import BdgsError, ConfigError
@@ -86,10 +84,11 @@ class MappingNode(GraphNode):
 
     def _serve(self) -> None:
         # A service waits for the keyframe at hand; meanwhile images must still be taken.
-        group = MutuallyExclusiveCallbackGroup()
-        serve_trigger(self, topics.SAVE_MAP, self._on_save, group)
-        serve_trigger(self, topics.LOAD_MAP, self._on_load, group)
-        serve_switch(self, topics.SET_LOCALIZATION_MODE, self._on_localization, group)
+        self._side = SideNode(self)
+        self._side.serve_trigger(topics.SAVE_MAP, self._on_save)
+        self._side.serve_trigger(topics.LOAD_MAP, self._on_load)
+        self._side.serve_switch(topics.SET_LOCALIZATION_MODE, self._on_localization)
+        self._side.start()
 
     def _keep_frame(self, raw: RawFrame) -> None:
         self._frames.put(raw.stamp_ns, raw)
@@ -225,12 +224,13 @@ class MappingNode(GraphNode):
 
     def close(self) -> None:
         """Stop working."""
+        self._side.stop()
         self._worker.stop()
 
 
 def main(args: list[str] | None = None) -> int:
     """Run the node."""
-    return run(MappingNode, args, lambda: MultiThreadedExecutor(2))
+    return run(MappingNode, args)
 
 
 if __name__ == '__main__':
