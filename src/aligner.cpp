@@ -113,9 +113,13 @@ struct Level {
         cy(like.cy), images(shared), p_static(like.p_static.size(), 1.0f) {}
 };
 
+// Motion of the camera while its image was read out, first row to last: (rho, phi), in its frame.
+using Sweep = std::array<float, 6>;
+
 struct Pyramid {
   std::vector<Level> levels;  // finest first
   int block = 1;              // input pixels per pixel of the finest level and axis
+  Sweep sweep{};
   Pyramid() = default;
   Pyramid(const Pyramid&) = delete;
 };
@@ -312,7 +316,8 @@ const T* data_of(const py::object& object, int height, int width, const char* na
 
 Pyramid* build_pyramid(const py::object& image, const py::object& depth_m,
                        const py::object& p_dynamic, int width, int height, double fx, double fy,
-                       double cx, double cy, int block, int n_levels, double depth_noise) {
+                       double cx, double cy, int block, int n_levels, double depth_noise,
+                       const Sweep& sweep) {
   py::array_t<uint8_t, py::array::c_style> keep_image, keep_dynamic;
   py::array_t<float, py::array::c_style> keep_depth;
   int channels = 1;
@@ -325,6 +330,7 @@ Pyramid* build_pyramid(const py::object& image, const py::object& depth_m,
   const float noise = static_cast<float>(depth_noise);
   auto pyramid = std::make_unique<Pyramid>();
   pyramid->block = block;
+  pyramid->sweep = sweep;
   pyramid->levels.reserve(n_levels);
   pyramid->levels.emplace_back(width / block, height / block);
   average_image(pixels, width, channels, block, pyramid->levels[0]);
@@ -355,7 +361,8 @@ Pyramid* build_pyramid(const py::object& image, const py::object& depth_m,
   return pyramid.release();
 }
 
-Pyramid* with_dynamic(const Pyramid& pyramid, const py::object& p_dynamic, int width, int height) {
+Pyramid* with_dynamic(const Pyramid& pyramid, const py::object& p_dynamic, int width, int height,
+                      const Sweep& sweep) {
   py::array_t<uint8_t, py::array::c_style> keep;
   const uint8_t* dynamic = data_of<uint8_t>(p_dynamic, height, width, "p_dynamic", keep);
   if (width / pyramid.block != pyramid.levels[0].width ||
@@ -364,15 +371,22 @@ Pyramid* with_dynamic(const Pyramid& pyramid, const py::object& p_dynamic, int w
   py::gil_scoped_release release;
   auto masked = std::make_unique<Pyramid>();
   masked->block = pyramid.block;
+  masked->sweep = sweep;
   masked->levels.reserve(pyramid.levels.size());
   for (const Level& level : pyramid.levels) masked->levels.emplace_back(level.images, level);
   fill_static(*masked, dynamic, width);
   return masked.release();
 }
 
+// Row of a level as a share of the readout, 0 in the middle of the image.
+BDGS_INLINE float row_share(float v, float rows) {
+  return min_f(max_f((v + 0.5f) / rows, 0.0f), 1.0f) - 0.5f;
+}
+
 constexpr float kLeastStatic = 0.02f;  // what surely moves is not worth its time
 
-void collect_points(Level& level) {
+// Points where the camera sees them in the middle of its readout.
+void collect_points(Level& level, const Sweep& s) {
   const Images& images = *level.images;
   Points& points = level.points;
   const size_t n = static_cast<size_t>(level.width) * level.height;
@@ -384,10 +398,12 @@ void collect_points(Level& level) {
       const size_t i = static_cast<size_t>(v) * level.width + u;
       const float inverse = images.inverse_depth[i];
       if (inverse <= 0 || level.p_static[i] < kLeastStatic) continue;
+      const float r = row_share(static_cast<float>(v), static_cast<float>(level.height));
       const float z = 1.0f / inverse;
-      points.x.push_back((u - level.cx) / level.fx * z);
-      points.y.push_back((v - level.cy) / level.fy * z);
-      points.z.push_back(z);
+      const float x = (u - level.cx) / level.fx * z, y = (v - level.cy) / level.fy * z;
+      points.x.push_back(x + r * (s[0] + s[4] * z - s[5] * y));
+      points.y.push_back(y + r * (s[1] + s[5] * x - s[3] * z));
+      points.z.push_back(z + r * (s[2] + s[3] * y - s[4] * x));
       points.grey.push_back(images.grey[i]);
       points.gx.push_back(images.gx[i]);
       points.gy.push_back(images.gy[i]);
@@ -396,8 +412,9 @@ void collect_points(Level& level) {
   }
 }
 
-const Points& points_of(Level& level) {
-  std::call_once(*level.points_once, [&] { collect_points(level); });
+const Points& points_of(Pyramid& pyramid, int index) {
+  Level& level = pyramid.levels.at(index);
+  std::call_once(*level.points_once, [&] { collect_points(level, pyramid.sweep); });
   return level.points;
 }
 
@@ -418,6 +435,7 @@ struct Scales {
 struct State {
   float R[9], t[3], gain, bias, pattern[kPattern];
   Scales scales;
+  Sweep sweep;  // of the current image
 };
 
 struct Totals {
@@ -463,6 +481,7 @@ BDGS_INLINE void fill_block_body(const Points* points, int begin, int n, const L
   const int width = level->width;
   const float fx = level->fx, fy = level->fy, cx = level->cx, cy = level->cy;
   const float max_u = level->width - 2.0f, max_v = level->height - 2.0f;
+  const float rows = static_cast<float>(level->height);
   const float var_I = s.scales.intensity * s.scales.intensity;
   const float var_D = s.scales.inverse_depth * s.scales.inverse_depth;
   const float var_px = static_cast<float>(params->pixel_noise * params->pixel_noise);
@@ -475,9 +494,14 @@ BDGS_INLINE void fill_block_body(const Points* points, int begin, int n, const L
   for (int i = 0; i < n; ++i) {
     // where the reference point lies in the current image
     const float X = px[i], Y = py_[i], Z = pz[i];
-    const float x = s.R[0] * X + s.R[1] * Y + s.R[2] * Z + s.t[0];
-    const float y = s.R[3] * X + s.R[4] * Y + s.R[5] * Z + s.t[1];
-    const float z_raw = s.R[6] * X + s.R[7] * Y + s.R[8] * Z + s.t[2];
+    const float xm = s.R[0] * X + s.R[1] * Y + s.R[2] * Z + s.t[0];
+    const float ym = s.R[3] * X + s.R[4] * Y + s.R[5] * Z + s.t[1];
+    const float zm = s.R[6] * X + s.R[7] * Y + s.R[8] * Z + s.t[2];
+    // ... and where when its row was read out
+    const float r = row_share(fy * ym / (zm > 0.05f ? zm : 1.0f) + cy, rows);
+    const float x = xm - r * (s.sweep[0] + s.sweep[4] * zm - s.sweep[5] * ym);
+    const float y = ym - r * (s.sweep[1] + s.sweep[5] * xm - s.sweep[3] * zm);
+    const float z_raw = zm - r * (s.sweep[2] + s.sweep[3] * ym - s.sweep[4] * xm);
     const float z = z_raw > 0.05f ? z_raw : 1.0f;
     const float iz = 1.0f / z;
     const float tx = x * iz, ty = y * iz;
@@ -785,8 +809,10 @@ struct Prior {
   bool active = false;
 };
 
-State state_of(const Matrix4& T, const Appearance& appearance, const Scales& scales) {
+State state_of(const Matrix4& T, const Appearance& appearance, const Scales& scales,
+               const Sweep& sweep) {
   State s;
+  s.sweep = sweep;
   for (int i = 0; i < 3; ++i) {
     for (int j = 0; j < 3; ++j) s.R[3 * i + j] = static_cast<float>(T[4 * i + j]);
     s.t[i] = static_cast<float>(T[4 * i + 3]);
@@ -865,19 +891,20 @@ Solution run_alignment(Pyramid& reference, Pyramid& current,
   Scales scales;
   int left = params.max_iterations;
   for (size_t k = 0; k < pairs.size(); ++k) {
-    const Points& points = points_of(reference.levels[pairs[k].first]);
+    const Points& points = points_of(reference, pairs[k].first);
     const Level& target = current.levels[pairs[k].second];
     const int finer = static_cast<int>(pairs.size() - k - 1);
     const int budget = std::min(left, std::max(2, left - kReserved * finer));
     const double stop = params.stop_px * (finer > 0 ? kCoarseStop : 1.0);
     Samples samples;
-    probe(points, target, state_of(out.T, out.appearance, scales), params, samples);
+    probe(points, target, state_of(out.T, out.appearance, scales, current.sweep), params, samples);
     scales = scales_of(samples, params);
     out.converged = false;
     for (int i = 0; i < budget && !out.converged; ++i, --left) {
       Samples seen;
       const Totals totals =
-          accumulate(points, target, state_of(out.T, out.appearance, scales), params, seen);
+          accumulate(points, target, state_of(out.T, out.appearance, scales, current.sweep),
+                     params, seen);
       const double size = step(totals, prior, params, target.fx, out.T, out.appearance);
       if (size < 0) break;
       ++out.iterations;
@@ -886,9 +913,9 @@ Solution run_alignment(Pyramid& reference, Pyramid& current,
     }
   }
   Samples samples;
-  out.totals = accumulate(points_of(reference.levels[pairs.back().first]),
+  out.totals = accumulate(points_of(reference, pairs.back().first),
                           current.levels[pairs.back().second],
-                          state_of(out.T, out.appearance, scales), params, samples);
+                          state_of(out.T, out.appearance, scales, current.sweep), params, samples);
   out.median_I = Samples::median(samples.I);
   out.median_D = Samples::median(samples.D);
   return out;
@@ -907,11 +934,17 @@ void splat(const Points& points, const Level& target, const State& s, float min_
   for (int i = 0; i < points.size(); ++i) {
     if (points.p_static[i] < min_static) continue;
     const float X = points.x[i], Y = points.y[i], Z = points.z[i];
-    const float z = s.R[6] * X + s.R[7] * Y + s.R[8] * Z + s.t[2];
+    const float xm = s.R[0] * X + s.R[1] * Y + s.R[2] * Z + s.t[0];
+    const float ym = s.R[3] * X + s.R[4] * Y + s.R[5] * Z + s.t[1];
+    const float zm = s.R[6] * X + s.R[7] * Y + s.R[8] * Z + s.t[2];
+    if (!(zm > 0.05f)) continue;
+    const float r = row_share(target.fy * ym / zm + target.cy, static_cast<float>(target.height));
+    const float z = zm - r * (s.sweep[2] + s.sweep[3] * ym - s.sweep[4] * xm);
     if (!(z > 0.05f)) continue;
     const float iz = 1.0f / z;
-    const float u = target.fx * (s.R[0] * X + s.R[1] * Y + s.R[2] * Z + s.t[0]) * iz + target.cx;
-    const float v = target.fy * (s.R[3] * X + s.R[4] * Y + s.R[5] * Z + s.t[1]) * iz + target.cy;
+    const float x = xm - r * (s.sweep[0] + s.sweep[4] * zm - s.sweep[5] * ym);
+    const float y = ym - r * (s.sweep[1] + s.sweep[5] * xm - s.sweep[3] * zm);
+    const float u = target.fx * x * iz + target.cx, v = target.fy * y * iz + target.cy;
     if (!(u > -0.5f && v > -0.5f && u < target.width - 0.5f && v < target.height - 0.5f)) continue;
     const size_t at = static_cast<size_t>(static_cast<int>(v + 0.5f)) * target.width +
                       static_cast<int>(u + 0.5f);
@@ -999,9 +1032,9 @@ py::dict normal_equations(Pyramid& reference, Pyramid& current, int reference_le
   const Scales scales{static_cast<float>(intensity_scale),
                       static_cast<float>(inverse_depth_scale)};
   const State state = state_of(matrix_of(T, "T_current_reference"),
-                               appearance_of(gain, bias, pattern), scales);
+                               appearance_of(gain, bias, pattern), scales, current.sweep);
   Samples samples;
-  const Totals totals = accumulate(points_of(reference.levels.at(reference_level)),
+  const Totals totals = accumulate(points_of(reference, reference_level),
                                    current.levels.at(current_level), state, params, samples);
   return totals_dict(totals, Samples::median(samples.I), Samples::median(samples.D));
 }
@@ -1038,15 +1071,14 @@ py::tuple residual_maps(Pyramid& reference, Pyramid& current, int reference_leve
                         int current_level, const Array& T, double gain, double bias,
                         const Params& params) {
   const State state = state_of(matrix_of(T, "T_current_reference"),
-                               appearance_of(gain, bias, {0, 0, 0}), Scales());
-  Level& source = reference.levels.at(reference_level);
+                               appearance_of(gain, bias, {0, 0, 0}), Scales(), current.sweep);
   const Level& target = current.levels.at(current_level);
   Maps maps;
   {
     py::gil_scoped_release release;
     const size_t n = static_cast<size_t>(target.width) * target.height;
     Plane inverse_depth(n), grey(n);
-    splat(points_of(source), target, state, 0.5f, inverse_depth, grey);
+    splat(points_of(reference, reference_level), target, state, 0.5f, inverse_depth, grey);
     maps = compare(target, inverse_depth, grey, state, static_cast<float>(params.depth_noise));
   }
   return py::make_tuple(plane_array(maps.depth_sigma, target.height, target.width),
@@ -1096,7 +1128,7 @@ PYBIND11_MODULE(_aligner, m) {
   m.def("build_pyramid", &build_pyramid, py::arg("image"), py::arg("depth_m"),
         py::arg("p_dynamic").none(true), py::arg("width"), py::arg("height"), py::arg("fx"),
         py::arg("fy"), py::arg("cx"), py::arg("cy"), py::arg("block"), py::arg("n_levels"),
-        py::arg("depth_noise"));
+        py::arg("depth_noise"), py::arg("sweep"));
   m.def("with_dynamic", &with_dynamic);
   m.def("normal_equations", &normal_equations);
   m.def("align", &align);

@@ -75,6 +75,7 @@ class ModelView:
     The static map rendered at a keyframe: the feedback from mapping to tracking.
 
     `depth_m` is 0 where the map is empty; `p_dynamic` is the posterior of what is seen there.
+    `readout_s` is what has been learnt of the camera's rolling shutter, None while it is unknown.
     """
 
     stamp_ns: int
@@ -83,6 +84,7 @@ class ModelView:
     color: ColorImage
     depth_m: DepthImage
     p_dynamic: ProbabilityImage
+    readout_s: float | None = None
 
 
 class TrackingStatus(Enum):

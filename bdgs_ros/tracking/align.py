@@ -32,6 +32,7 @@ except ImportError:
 _log = logging.getLogger(__name__)
 
 _FINE_LEVELS = 2  # of a refinement
+_AT_REST = np.zeros(6)
 
 
 @dataclass(frozen=True)
@@ -119,6 +120,7 @@ class Aligner:
         depth_m: DepthImage,
         p_dynamic: ProbabilityImage | None,
         camera: PinholeCamera,
+        sweep: NDArray[np.float64] | None = None,
     ) -> ImagePyramid:
         """
         Prepare an image for alignment, as reference or as current.
@@ -133,6 +135,9 @@ class Aligner:
             P(dynamic) x 255; None where everything may be static.
         camera : PinholeCamera
             Rectified.
+        sweep : ndarray, shape (6,), optional
+            Motion of the camera while the image was read out, (rho, phi) in its frame; None
+            for a global shutter, or a camera at rest.
 
         Raises
         ------
@@ -155,14 +160,25 @@ class Aligner:
             block,
             count,
             self._config.depth_noise,
+            _AT_REST if sweep is None else sweep,
         )
         widths = tuple(handle.level(i).width for i in range(count))
         return ImagePyramid(handle, camera, widths)
 
-    def with_dynamic(self, pyramid: ImagePyramid, p_dynamic: ProbabilityImage) -> ImagePyramid:
-        """Return the pyramid of the same image with another mask; far cheaper than a new one."""
+    def with_dynamic(
+        self,
+        pyramid: ImagePyramid,
+        p_dynamic: ProbabilityImage,
+        sweep: NDArray[np.float64] | None = None,
+    ) -> ImagePyramid:
+        """
+        Return the pyramid of the same image with another mask and motion during the readout.
+
+        Far cheaper than a new one.
+        """
         height, width = pyramid.camera.shape
-        handle = self._backend.with_dynamic(pyramid.handle, p_dynamic, width, height)
+        still = _AT_REST if sweep is None else sweep
+        handle = self._backend.with_dynamic(pyramid.handle, p_dynamic, width, height, still)
         return ImagePyramid(handle, pyramid.camera, pyramid.widths)
 
     def align(

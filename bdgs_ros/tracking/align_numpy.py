@@ -21,9 +21,16 @@ second-order minimisation, Malis 2004).
 
 The motion is updated from the left, `T <- exp(xi) T`, `xi = (rho, phi)`.
 
+Rows of a rolling shutter are read out one after the other while the camera moves on by `sweep`,
+a tangent of its own frame. T joins the two cameras in the middle of their readouts; at the row a
+share r in [-0.5, 0.5] off the middle a camera is at `T_world_camera exp(r sweep)`. Points are
+taken there to first order, `p_row = p - r (rho + phi x p)`, with the row they have without.
+
 References
 ----------
 Kerl, Sturm, Cremers, "Robust odometry estimation for RGB-D cameras", ICRA 2013 (t-distribution).
+Kerl, Stueckler, Cremers, "Dense continuous-time tracking and mapping with rolling shutter RGB-D
+cameras", ICCV 2015 (that rows are read one after the other).
 """
 
 from __future__ import annotations
@@ -96,16 +103,28 @@ class Points:
     p_static: Array
 
 
-def collect_points(level: Level) -> Points:
-    """Lift the inner pixels with depth that may be static."""
+def row_share(v: Array, height: int) -> Array:
+    """Return when a row is read out, as a share of the readout, 0 in the middle."""
+    return np.asarray(np.clip((v + 0.5) / height, 0.0, 1.0) - 0.5)
+
+
+def swept(points: Array, share: Array, sweep: Array) -> Array:
+    """Return where a camera has points, shape (K, 3), once it moved by `share` of `sweep`."""
+    return np.asarray(points - share[:, None] * (sweep[:3] + np.cross(sweep[3:], points)))
+
+
+def collect_points(pyramid: Pyramid, index: int) -> Points:
+    """Lift the inner pixels with depth that may be static, to the middle of the readout."""
+    level = pyramid.level(index)
     inner = np.zeros((level.height, level.width), bool)
     inner[1:-1, 1:-1] = True
     chosen = inner & (level.inverse_depth > 0) & (level.p_static >= _LEAST_STATIC)
     v, u = np.nonzero(chosen)
     fx, fy, cx, cy = level.intrinsics
     z = 1.0 / level.inverse_depth[v, u].astype(np.float64)
+    seen = np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], axis=1)
     return Points(
-        np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], axis=1),
+        swept(seen, -row_share(v, level.height), pyramid.sweep),
         level.grey[v, u].astype(np.float64),
         np.stack([level.gx[v, u], level.gy[v, u]], axis=1).astype(np.float64),
         level.p_static[v, u].astype(np.float64),
@@ -122,9 +141,17 @@ class Warp:
     v: Array
 
 
-def warp(points: Points, level: Level, T: Array) -> Warp:
+def move(points: Array, level: Level, T: Array, sweep: Array) -> Array:
+    """Take points, shape (K, 3), to the current camera when it reads out their row."""
+    middle = points @ T[:3, :3].T + T[:3, 3]
+    z = np.where(middle[:, 2] > _LEAST_DEPTH_M, middle[:, 2], 1.0)
+    _, fy, _, cy = level.intrinsics
+    return swept(middle, row_share(fy * middle[:, 1] / z + cy, level.height), sweep)
+
+
+def warp(points: Points, level: Level, T: Array, sweep: Array) -> Warp:
     """Move and project; what is not seen gets pixel (1, 1) and depth 1 m."""
-    xyz = points.xyz @ T[:3, :3].T + T[:3, 3]
+    xyz = move(points.xyz, level, T, sweep)
     ahead = xyz[:, 2] > _LEAST_DEPTH_M
     xyz[:, 2] = np.where(ahead, xyz[:, 2], 1.0)
     fx, fy, cx, cy = level.intrinsics
@@ -194,9 +221,11 @@ class Linearised:
     inverse_z: Array
 
 
-def linearise(points: Points, level: Level, T: Array, appearance: Appearance) -> Linearised:
+def linearise(
+    points: Points, level: Level, T: Array, sweep: Array, appearance: Appearance
+) -> Linearised:
     """Return residuals and their derivatives by motion, exposure and depth pattern."""
-    w = warp(points, level, T)
+    w = warp(points, level, T, sweep)
     gain, bias = appearance.values[:2]
     e_I = _bilinear(level.grey, w)[0] - (gain * points.grey + bias)
     measured, smooth = _bilinear(level.smooth, w)
@@ -322,10 +351,10 @@ def normal_equations(
     params: Params,
 ) -> dict[str, Any]:
     """Return `information`, shape (11, 11), and `gradient`, shape (11,), at one pose."""
-    points = collect_points(reference.level(reference_level))
+    points = collect_points(reference, reference_level)
     level = current.level(current_level)
     appearance = Appearance(np.array([gain, bias, *pattern]))
-    rows = linearise(points, level, T, appearance)
+    rows = linearise(points, level, T, current.sweep, appearance)
     return _totals(points, level, rows, Scales(intensity_scale, inverse_depth_scale), params)
 
 
@@ -379,14 +408,14 @@ def align(
     prior = None if T_prior is None or information is None else (T_prior, information)
     left, done, converged, scales = params.max_iterations, 0, False, Scales()
     for index, (i, j) in enumerate(pairs):
-        points, level = collect_points(reference.level(i)), current.level(j)
+        points, level = collect_points(reference, i), current.level(j)
         finer = len(pairs) - index - 1
         budget = min(left, max(2, left - _RESERVED * finer))
         stop = params.stop_px * (_COARSE_STOP if finer else 1.0)
-        scales = _scales(linearise(points, level, T, appearance), params)
+        scales = _scales(linearise(points, level, T, current.sweep, appearance), params)
         converged = False
         while budget > 0 and not converged:
-            rows = linearise(points, level, T, appearance)
+            rows = linearise(points, level, T, current.sweep, appearance)
             step = _step(
                 _totals(points, level, rows, scales, params), T, appearance, prior, params
             )
@@ -395,8 +424,8 @@ def align(
             scales = _scales(rows, params)
             converged = _step_px(step, level) < stop
             budget, left, done = budget - 1, left - 1, done + 1
-    points, level = collect_points(reference.level(pairs[-1][0])), current.level(pairs[-1][1])
-    rows = linearise(points, level, T, appearance)
+    points, level = collect_points(reference, pairs[-1][0]), current.level(pairs[-1][1])
+    rows = linearise(points, level, T, current.sweep, appearance)
     return {
         **_totals(points, level, rows, scales, params),
         'T': T,
@@ -420,7 +449,7 @@ def residual_maps(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
     """Compare the current level with the reference warped into it: depth, colour, validity."""
     level = current.level(current_level)
-    rho, grey = _splat(collect_points(reference.level(reference_level)), level, T)
+    rho, grey = _splat(collect_points(reference, reference_level), level, T, current.sweep)
     valid = (rho > 0) & (level.inverse_depth > 0)
     far, near = _window(np.where(rho > 0, rho, np.inf), np.minimum), _window(rho, np.maximum)
     dark = _window(np.where(rho > 0, grey, np.inf), np.minimum)
@@ -437,10 +466,10 @@ def residual_maps(
     )
 
 
-def _splat(points: Points, level: Level, T: Array) -> tuple[Array, Array]:
+def _splat(points: Points, level: Level, T: Array, sweep: Array) -> tuple[Array, Array]:
     """Return the z-buffer (inverse depth, 0 = empty) of static points, and their grey levels."""
     static = points.p_static >= 0.5
-    xyz = points.xyz[static] @ T[:3, :3].T + T[:3, 3]
+    xyz = move(points.xyz[static], level, T, sweep)
     grey = points.grey[static]
     ahead = xyz[:, 2] > _LEAST_DEPTH_M
     xyz, grey = xyz[ahead], grey[ahead]

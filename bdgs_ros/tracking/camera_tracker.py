@@ -66,6 +66,7 @@ class CameraTracker:
         )
         self._motion = MotionPredictor(config.motion)
         self._movers = MoverMask(config.movers)
+        self._readout_s = config.readout_s  # of the camera: outlives a reset
         self.reset()
 
     def reset(self) -> None:
@@ -102,6 +103,8 @@ class CameraTracker:
         if view is None:
             return
         self._follow(view)
+        if view.readout_s is not None:
+            self._readout_s = view.readout_s
         posterior = view.p_dynamic if self._config.refine.posterior else None
         pyramid = self._aligner.pyramid(view.color, view.depth_m, posterior, view.camera)
         self._model = Reference(view.T_world_camera, pyramid)
@@ -139,7 +142,8 @@ class CameraTracker:
         """
         prior = self._prior(frame, labels)
         expected = np.maximum(prior, self._movers.expected(frame.camera.shape))
-        current = self._aligner.pyramid(frame.color, frame.depth_m, expected, frame.camera)
+        sweep = self._readout_s * self._motion.velocity
+        current = self._aligner.pyramid(frame.color, frame.depth_m, expected, frame.camera, sweep)
         if self._keyframe is None:
             first = self._enter if self._world_is_known else self._start
             return first(frame, current, prior)
@@ -147,7 +151,10 @@ class CameraTracker:
         information = np.asarray(np.linalg.inv(covariance), np.float64)
         coarse = self._align(self._keyframe, current, predicted, information)
         p_dynamic = self._see_movers(prior, current, coarse)
-        current = self._aligner.with_dynamic(current, p_dynamic)
+        velocity = self._motion.velocity_with(
+            frame.stamp_ns, coarse.T_world_camera, coarse.quality.covariance
+        )
+        current = self._aligner.with_dynamic(current, p_dynamic, self._readout_s * velocity)
         fine = self._refine(current, coarse, information)
         return self._conclude(frame, current, coarse.quality.overlap, fine, p_dynamic, predicted)
 

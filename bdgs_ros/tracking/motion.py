@@ -85,6 +85,18 @@ class MotionPredictor:
         moved = self._propagate(self._state, stamp_ns)
         return moved.T_world_camera, moved.covariance[:6, :6]
 
+    @property
+    def velocity(self) -> Matrix:
+        """Shape (6,): (v, w) in the camera's frame, m/s and rad/s; 0 before the first update."""
+        return np.zeros(6) if self._state is None else self._state.velocity
+
+    def velocity_with(self, stamp_ns: int, T_world_camera: Pose, covariance: Matrix) -> Matrix:
+        """Return what the velocity would be after an update; changes nothing."""
+        kept = self._state
+        self.update(stamp_ns, T_world_camera, covariance)
+        velocity, self._state = self.velocity, kept
+        return velocity
+
     def update(self, stamp_ns: int, T_world_camera: Pose, covariance: Matrix) -> None:
         """
         Take a measured pose; one that is far off the prediction starts the velocity anew.

@@ -45,6 +45,8 @@ class Pyramid:
 
     levels: tuple[Level, ...]
     block: int
+    sweep: NDArray[np.float64]
+    """Shape (6,): motion of the camera while the image was read out, (rho, phi), its frame."""
 
     def __len__(self) -> int:
         """Return the number of levels."""
@@ -68,6 +70,7 @@ def build_pyramid(
     block: int,
     n_levels: int,
     depth_noise: float,
+    sweep: NDArray[np.float64],
 ) -> Pyramid:
     """
     Build all levels of one image; the finest averages `block` x `block` input pixels.
@@ -88,6 +91,8 @@ def build_pyramid(
         Each half as wide as the one before.
     depth_noise : float
         Standard deviation of inverse depth, 1/m.
+    sweep : ndarray, shape (6,)
+        Motion of the camera from the first row's readout to the last's, (rho, phi).
 
     """
     grey = _average(_to_grey(image), block)
@@ -103,19 +108,23 @@ def build_pyramid(
         scale = 1.0 / (block * 2**index)
         camera = (fx * scale, fy * scale, (cx + 0.5) * scale - 0.5, (cy + 0.5) * scale - 0.5)
         levels.append(_make_level(grey, inverse_depth, static, camera, depth_noise))
-    return Pyramid(tuple(levels), block)
+    return Pyramid(tuple(levels), block, np.asarray(sweep, np.float64))
 
 
 def with_dynamic(
-    pyramid: Pyramid, p_dynamic: NDArray[np.uint8], width: int, height: int
+    pyramid: Pyramid,
+    p_dynamic: NDArray[np.uint8],
+    width: int,
+    height: int,
+    sweep: NDArray[np.float64],
 ) -> Pyramid:
-    """Return the same images with another mask."""
+    """Return the same images with another mask and another motion during the readout."""
     static = _static(p_dynamic, (height, width), pyramid.block)
     levels = []
     for index, level in enumerate(pyramid.levels):
         static = static if index == 0 else _average(static, 2)
         levels.append(Level(**{**level.__dict__, 'p_static': static}))
-    return Pyramid(tuple(levels), pyramid.block)
+    return Pyramid(tuple(levels), pyramid.block, np.asarray(sweep, np.float64))
 
 
 def _to_grey(image: NDArray[np.uint8]) -> Plane:

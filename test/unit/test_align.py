@@ -356,10 +356,10 @@ def test_jacobians_are_derivatives() -> None:
         -0.0015 * one,
         one,
     )
-    points = align_numpy.collect_points(level)
-    T = se3.exp(0.3 * MOTION)
+    points = align_numpy.collect_points(align_numpy.Pyramid((level,), 1, np.zeros(6)), 0)
+    T, at_rest = se3.exp(0.3 * MOTION), np.zeros(6)
     values = np.array([1.1, 0.02, 0.01, 0.02, -0.03])
-    rows = align_numpy.linearise(points, level, T, align_numpy.Appearance(values))
+    rows = align_numpy.linearise(points, level, T, at_rest, align_numpy.Appearance(values))
     step = 1e-5
     for k in range(11):
         delta = np.zeros(11)
@@ -369,6 +369,7 @@ def test_jacobians_are_derivatives() -> None:
                 points,
                 level,
                 se3.exp(sign * delta[:6]) @ T,
+                at_rest,
                 align_numpy.Appearance(values + sign * delta[6:]),
             )
             for sign in (1, -1)
@@ -391,7 +392,9 @@ def _pattern_slope(
 ) -> np.ndarray:
     """Return how the pattern itself moves with the camera: left out of the Jacobian as small."""
     ends = [
-        align_numpy._pattern(points, align_numpy.warp(points, level, se3.exp(s * delta) @ T))
+        align_numpy._pattern(
+            points, align_numpy.warp(points, level, se3.exp(s * delta) @ T, np.zeros(6))
+        )
         for s in (1, -1)
     ]
     return (ends[0] - ends[1]) @ values[2:] / (2 * step)

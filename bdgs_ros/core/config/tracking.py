@@ -135,6 +135,13 @@ class TrackingConfig:
     lost_gain: float = param(
         3.0, 'exposure changed by more than this factor, or contrast is gone: lost', low=1.1
     )
+    readout_s: float = param(
+        0.0,
+        'from first row to last of a rolling shutter, until the back end has measured it',
+        unit='s',
+        low=-0.1,
+        high=0.1,
+    )
     motion: MotionConfig = field(default_factory=MotionConfig)
     align: AlignConfig = field(default_factory=AlignConfig)
     refine: RefineConfig = field(default_factory=RefineConfig)
