@@ -124,7 +124,7 @@ def collect_points(pyramid: Pyramid, index: int) -> Points:
     z = 1.0 / level.inverse_depth[v, u].astype(np.float64)
     seen = np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], axis=1)
     return Points(
-        swept(seen, -row_share(v, level.height), pyramid.sweep),
+        swept(seen, -row_share(v.astype(np.float64), level.height), pyramid.sweep),
         level.grey[v, u].astype(np.float64),
         np.stack([level.gx[v, u], level.gy[v, u]], axis=1).astype(np.float64),
         level.p_static[v, u].astype(np.float64),
