@@ -22,7 +22,7 @@ from bdgs_ros.core.types import Labels
 from bdgs_ros.detection.late import AtOnce, InBackground
 from bdgs_ros.detection.stage import DetectionStage
 
-_QUEUE = 2  # images that may wait for their labels in real time
+_QUEUE = 1  # images that may wait for their labels in real time: the newest is of most use
 
 
 class DetectionNode(GraphNode):
@@ -32,6 +32,7 @@ class DetectionNode(GraphNode):
         super().__init__('detection_node', **options)
         config = parameters.declare(self, DetectionNodeConfig())
         cv2.setNumThreads(1)
+        self.nice = config.detection_nice
         self._health = Health(self, 'detection')
         # In real time the network has a thread of its own and the newest image, and labels come
         # at camera rate from the object tracks; in lockstep every image is waited for.
@@ -42,7 +43,10 @@ class DetectionNode(GraphNode):
         self._detections = optional.DetectionsPublisher(self)
         self._decoder = FrameDecoder.of(self)
         self._worker: Worker[RawFrame] = Worker(
-            self._on_frame, self._health.error, None if config.lockstep else _QUEUE
+            self._on_frame,
+            self._health.error,
+            None if config.lockstep else _QUEUE,
+            nice=config.detection_nice,
         )
         self._source = FrameSource(self, config, self._health, self._worker.put, self._reset)
         self.create_subscription(
