@@ -334,7 +334,7 @@ def test_a_share_of_the_points_stands_for_all(noisy: tuple) -> None:
         results.append(aligner.align(reference, current, np.eye(4)))
     some, every = results
     assert some.coverage == pytest.approx(every.coverage, rel=0.1)
-    assert some.overlap == pytest.approx(every.overlap, abs=0.05)
+    assert some.overlap == pytest.approx(every.overlap, abs=0.08)
     assert np.sqrt(np.diag(some.covariance)) == pytest.approx(
         np.sqrt(np.diag(every.covariance)), rel=0.3
     )
