@@ -77,6 +77,7 @@ struct Params {
   double inlier_intensity = 0.08;
   double inlier_depth_sigma = 6.0;
   double min_static = 0.25;
+  int max_points = 20000;
 };
 
 // What is worth comparing in a reference level, in rows of the image.
@@ -658,29 +659,51 @@ struct Samples {
 
 constexpr int kSampleBlocks = 16;
 
-int sample_stride(int n_blocks) { return std::max(1, n_blocks / kSampleBlocks); }
+// Which blocks of a level are compared, and of which of them the medians are taken.
+struct Blocks {
+  int all, step, sample;  // step and sample in blocks
+
+  Blocks(const Points& points, const Params& params)
+      : all((points.size() + kBlock - 1) / kBlock),
+        step(std::max(1, points.size() / std::max(1, params.max_points))),
+        sample(step * std::max(1, (all + step - 1) / step / kSampleBlocks)) {}
+};
+
+// The sums stand for all points, however many were compared.
+void scale_to(int all, int compared, Totals& totals) {
+  const double scale = compared > 0 ? static_cast<double>(all) / compared : 1.0;
+  for (int i = 0; i < kUnknowns; ++i) {
+    totals.g[i] *= scale;
+    for (int j = i; j < kUnknowns; ++j) totals.H[j][i] = totals.H[i][j] *= scale;
+  }
+  totals.cost *= scale;
+  totals.weight *= scale;
+  for (int* count : {&totals.in_view, &totals.reference, &totals.compared, &totals.inliers})
+    *count = static_cast<int>(*count * scale + 0.5);
+}
 
 Totals accumulate(const Points& points, const Level& level, const State& state,
                   const Params& params, Samples& samples) {
   Totals totals;
   Block block;
-  const int n_blocks = (points.size() + kBlock - 1) / kBlock, stride = sample_stride(n_blocks);
-  for (int k = 0; k < n_blocks; ++k) {
+  const Blocks blocks(points, params);
+  int compared = 0;
+  for (int k = 0; k < blocks.all; k += blocks.step) {
     const int begin = k * kBlock, n = std::min(kBlock, points.size() - begin);
     fill_block(&points, begin, n, &level, &state, &params, &block);
     add_block(&block, n, &totals);
-    if (k % stride == 0) samples.add(block, n);
+    if (k % blocks.sample == 0) samples.add(block, n);
+    compared += n;
   }
-  for (int i = 0; i < kUnknowns; ++i)
-    for (int j = 0; j < i; ++j) totals.H[i][j] = totals.H[j][i];
+  scale_to(points.size(), compared, totals);
   return totals;
 }
 
 void probe(const Points& points, const Level& level, const State& state, const Params& params,
            Samples& samples) {
   Block block;
-  const int n_blocks = (points.size() + kBlock - 1) / kBlock, stride = sample_stride(n_blocks);
-  for (int k = 0; k < n_blocks; k += stride) {
+  const Blocks blocks(points, params);
+  for (int k = 0; k < blocks.all; k += blocks.sample) {
     const int begin = k * kBlock, n = std::min(kBlock, points.size() - begin);
     fill_block(&points, begin, n, &level, &state, &params, &block);
     samples.add(block, n);
@@ -1102,7 +1125,8 @@ PYBIND11_MODULE(_aligner, m) {
       .def_readwrite("pattern_information", &Params::pattern_information)
       .def_readwrite("inlier_intensity", &Params::inlier_intensity)
       .def_readwrite("inlier_depth_sigma", &Params::inlier_depth_sigma)
-      .def_readwrite("min_static", &Params::min_static);
+      .def_readwrite("min_static", &Params::min_static)
+      .def_readwrite("max_points", &Params::max_points);
   auto plane = [](Plane Images::*member) {
     return [member](const Level& l) { return plane_array((*l.images).*member, l.height, l.width); };
   };

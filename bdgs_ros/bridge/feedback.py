@@ -80,7 +80,9 @@ class Feedback:
         except DatasetError as error:
             self._health.warn(str(error))
             return None
-        return Labels(conversions.stamp_ns(message), p_dynamic)
+        stamp_ns = conversions.stamp_ns(message)
+        self._health.add_timing('labels_age', (frame.stamp_ns - stamp_ns) * 1e-6)
+        return Labels(stamp_ns, p_dynamic)
 
     def _find_labels(self, stamp_ns: int) -> CdrImage | None:
         if self._config.lockstep:

@@ -71,7 +71,10 @@ class GraphConfig:
 class DetectionNodeConfig(GraphConfig):
     """Parameters of detection_node."""
 
-    detection_nice: int = param(5, 'how much the detector gives way to tracking', low=0, high=19)
+    labels_rate: float = param(
+        15.0, 'images labelled at most, others are passed over (realtime)', unit='Hz', low=0.1
+    )
+    detection_nice: int = param(5, 'how much detection gives way to tracking', low=0, high=19)
     detection: DetectionConfig = field(default_factory=DetectionConfig)
 
 
@@ -86,7 +89,7 @@ class TrackingNodeConfig(GraphConfig):
     labels_max_age_s: float = param(
         0.5, 'older labels are not used (realtime)', unit='s', low=0.0, high=10.0
     )
-    frame_queue: int = param(5, 'frames that may wait for tracking (realtime)', low=1, high=1000)
+    frame_queue: int = param(15, 'frames that may wait for tracking (realtime)', low=1, high=1000)
     trajectory_file: str = param('', 'where bdgs/save_trajectory writes; may change at run time')
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
 

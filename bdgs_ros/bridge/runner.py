@@ -16,6 +16,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from bdgs_ros.bridge import transport
+from bdgs_ros.bridge.priority import give_way
 from bdgs_ros.core.errors import BdgsError
 
 PARENT_VARIABLE = 'BDGS_PARENT_PID'
@@ -32,6 +33,8 @@ class GraphNode(Node):
         super().__init__(name, **kwargs)
         self.exit_code = 0
         self.finished = False
+        self.nice = 0
+        """How much its callbacks give way to other processes; workers have their own."""
 
     def finish(self, exit_code: int = 0) -> None:
         """End the process from any thread, when the current callback is over."""
@@ -74,6 +77,7 @@ def run(
     node: GraphNode | None = None
     try:
         node = factory()
+        give_way(node.nice)
         executor = make_executor()
         executor.add_node(node)
         while not (node.finished or stop.is_set()):

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
 from functools import partial
 from typing import Generic, TypeVar
+
+from bdgs_ros.bridge.priority import give_way
 
 Item = TypeVar('Item')
 
@@ -31,7 +31,7 @@ class Worker(Generic[Item]):
     idle_period_s : float
         See `idle`.
     nice : int
-        How much the thread, and those it starts, give way to others (Linux).
+        How much the thread gives way to others, see `priority.give_way`.
 
     """
 
@@ -58,6 +58,11 @@ class Worker(Generic[Item]):
         self._stopping = False
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
+
+    @property
+    def waiting(self) -> int:
+        """How many items wait."""
+        return len(self._items)
 
     def put(self, item: Item) -> None:
         """Append an item; never waits."""
@@ -95,8 +100,7 @@ class Worker(Generic[Item]):
         self._thread.join(timeout_s)
 
     def _run(self) -> None:
-        if self._nice and sys.platform.startswith('linux'):  # elsewhere it is per process
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), self._nice)
+        give_way(self._nice)
         while not self._stopping:
             call = self._next()
             if call is not None:

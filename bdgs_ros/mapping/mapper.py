@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -54,12 +54,27 @@ _MIN_BLOB_SHARE = 0.002  # of the image; smaller things in front of the map are 
 
 
 class Mapper:
-    """The static Gaussian map, grown and optimised keyframe by keyframe."""
+    """
+    The static Gaussian map, grown and optimised keyframe by keyframe.
 
-    def __init__(self, mapping: MappingConfig, belief: BeliefConfig) -> None:
+    Parameters
+    ----------
+    mapping, belief : MappingConfig, BeliefConfig
+        All parameters.
+    hurried : callable
+        Asked during optimisation whether the next keyframe waits already; then it is shorter.
+
+    """
+
+    def __init__(
+        self,
+        mapping: MappingConfig,
+        belief: BeliefConfig,
+        hurried: Callable[[], bool] = lambda: False,
+    ) -> None:
         self._config = mapping
         self._belief = belief
-        self._optimiser = Optimiser(mapping)
+        self._optimiser = Optimiser(mapping, hurried)
         self.inference = Inference(belief)
         """May be replaced by one that keeps a record."""
         self.frozen = False

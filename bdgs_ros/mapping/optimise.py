@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,10 +32,22 @@ Plan = list[tuple[MapKeyframe, int]]
 
 
 class Optimiser:
-    """Fit the map to its keyframes: Eq. 7-9 with Adam, coarse to fine by Eq. 12-13."""
+    """
+    Fit the map to its keyframes: Eq. 7-9 with Adam, coarse to fine by Eq. 12-13.
 
-    def __init__(self, config: MappingConfig) -> None:
+    Parameters
+    ----------
+    config : MappingConfig
+        Steps and rates.
+    hurried : callable
+        Whether the next keyframe waits already: then the finest level gets
+        `config.hurried_fine` iterations.
+
+    """
+
+    def __init__(self, config: MappingConfig, hurried: Callable[[], bool] = lambda: False) -> None:
         self._config = config
+        self._hurried = hurried
         self._weights = LossWeights(
             color=config.loss.psim,
             ssim=config.loss.ssim,
@@ -82,19 +94,20 @@ class Optimiser:
         penalised = visible & (gaussians.states == State.DYNAMIC)
         coarse, fine = self._plan(newest, others)
 
-        def steps(plan: Plan, done: int) -> list[float]:
+        def step(done: int, view: tuple[MapKeyframe, int]) -> float:
             # poses settle: Adam's steps do not get smaller by themselves
-            calm = [(1 - (done + i) / self._config.iterations) ** 2 for i in range(len(plan))]
-            return [
-                self._step(gaussians, kf, level, visible, penalised, pose_scale=scale)
-                for (kf, level), scale in zip(plan, calm, strict=True)
-            ]
+            calm = (1 - done / self._config.iterations) ** 2
+            return self._step(gaussians, *view, visible, penalised, pose_scale=calm)
 
-        losses = steps(coarse, 0)
+        losses = [step(done, view) for done, view in enumerate(coarse)]
         seen = [loss for (kf, level), loss in zip(coarse, losses, strict=True) if kf is newest]
         if _gain(seen[len(seen) // 2 :]) < self._config.enough:
             fine = fine[: self._config.min_fine]
-        return losses + steps(fine, len(coarse))
+        for count, view in enumerate(fine):
+            if count >= self._config.hurried_fine and self._hurried():
+                break
+            losses.append(step(len(coarse) + count, view))
+        return losses
 
     def step(
         self,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from functools import partial
 from typing import Any
@@ -15,6 +16,7 @@ from bdgs_ros.bridge import conversions, optional, parameters, topics
 from bdgs_ros.bridge.frames import FrameDecoder, FrameSource, RawFrame
 from bdgs_ros.bridge.health import Health
 from bdgs_ros.bridge.node_config import DetectionNodeConfig
+from bdgs_ros.bridge.pace import Pace
 from bdgs_ros.bridge.runner import GraphNode, run
 from bdgs_ros.bridge.worker import Worker
 from bdgs_ros.core.errors import DatasetError
@@ -22,7 +24,7 @@ from bdgs_ros.core.types import Labels
 from bdgs_ros.detection.late import AtOnce, InBackground
 from bdgs_ros.detection.stage import DetectionStage
 
-_QUEUE = 2  # images that may wait for their labels in real time
+_QUEUE = 1  # images that may wait for their labels in real time: the newest is of most use
 
 
 class DetectionNode(GraphNode):
@@ -32,6 +34,7 @@ class DetectionNode(GraphNode):
         super().__init__('detection_node', **options)
         config = parameters.declare(self, DetectionNodeConfig())
         cv2.setNumThreads(1)
+        self.nice = config.detection_nice
         self._health = Health(self, 'detection')
         # In real time the network has a thread of its own and the newest image, and labels come
         # at camera rate from the object tracks; in lockstep every image is waited for.
@@ -42,13 +45,21 @@ class DetectionNode(GraphNode):
         self._detections = optional.DetectionsPublisher(self)
         self._decoder = FrameDecoder.of(self)
         self._worker: Worker[RawFrame] = Worker(
-            self._on_frame, self._health.error, None if config.lockstep else _QUEUE
+            self._on_frame,
+            self._health.error,
+            None if config.lockstep else _QUEUE,
+            nice=config.detection_nice,
         )
-        self._source = FrameSource(self, config, self._health, self._worker.put, self._reset)
+        self._pace = Pace(math.inf if config.lockstep else config.labels_rate)
+        self._source = FrameSource(self, config, self._health, self._on_pair, self._reset)
         self.create_subscription(
             Empty, topics.RESET_EVENT, lambda _: self._reset(), topics.RELIABLE
         )
         self.get_logger().info(f'detection is ready ({self._stage.status}): mode {config.mode}')
+
+    def _on_pair(self, raw: RawFrame) -> None:
+        if self._pace.is_due(raw.stamp_ns):
+            self._worker.put(raw)
 
     def _on_frame(self, raw: RawFrame) -> None:
         try:
@@ -88,6 +99,7 @@ class DetectionNode(GraphNode):
         self._health.counts['frames_dropped'] = self._worker.dropped
 
     def _reset(self) -> None:
+        self._pace.reset()
         self._worker.restart(self._stage.reset)
 
     def close(self) -> None:

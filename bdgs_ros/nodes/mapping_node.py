@@ -43,9 +43,10 @@ class MappingNode(GraphNode):
         super().__init__('mapping_node', **options)
         config = parameters.declare(self, MappingNodeConfig(), runtime=('map_file',))
         cv2.setNumThreads(1)
+        self.nice = config.mapping_nice
         self._config = config
         self._health = Health(self, 'mapping')
-        self._mapper = Mapper(config.mapping, config.belief)
+        self._mapper = Mapper(config.mapping, config.belief, self._is_hurried)
         self._lock = threading.Lock()  # of the mapper: worker and services
         self._version = 0
         self._saved = (0, time.monotonic())
@@ -125,6 +126,9 @@ class MappingNode(GraphNode):
         self._version += 1
         self._health.counts['keyframes'] += 1
         return view
+
+    def _is_hurried(self) -> bool:
+        return not self._config.lockstep and self._worker.waiting > 0
 
     def _wait_frame(self, stamp_ns: int) -> RawFrame | None:
         timeout_s = self._config.lockstep_timeout_s if self._config.lockstep else _FRAME_WAIT_S

@@ -334,6 +334,7 @@ def _make_params(config: AlignConfig, backend: ModuleType) -> Any:
         'inlier_intensity',
         'inlier_depth_sigma',
         'min_static',
+        'max_points',
     ):
         setattr(params, name, getattr(config, name))
     params.pattern_information = config.correlated_pixels / config.pattern_sigma**2

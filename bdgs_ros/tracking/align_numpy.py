@@ -81,6 +81,7 @@ class Params:
     inlier_intensity: float = 0.08
     inlier_depth_sigma: float = 6.0
     min_static: float = 0.25
+    max_points: int = 20000
 
 
 @dataclass
@@ -129,6 +130,17 @@ def collect_points(pyramid: Pyramid, index: int) -> Points:
         np.stack([level.gx[v, u], level.gy[v, u]], axis=1).astype(np.float64),
         level.p_static[v, u].astype(np.float64),
     )
+
+
+def spread(points: Points, params: Params) -> tuple[Points, float]:
+    """Keep every n-th run of points; return them, and how many each stands for."""
+    count = len(points.grey)
+    step = max(1, count // params.max_points)
+    kept = np.arange(count) // _BLOCK % step == 0
+    chosen = Points(
+        points.xyz[kept], points.grey[kept], points.gradient[kept], points.p_static[kept]
+    )
+    return chosen, count / max(1, int(kept.sum()))
 
 
 @dataclass(frozen=True)
@@ -304,9 +316,9 @@ def _same_surface(rows: Linearised, scales: Scales) -> NDArray[np.bool_]:
 
 
 def _totals(
-    points: Points, level: Level, rows: Linearised, scales: Scales, params: Params
+    points: Points, share: float, rows: Linearised, scales: Scales, params: Params
 ) -> dict[str, Any]:
-    """Sum the weighted normal equations and count pixels."""
+    """Sum the weighted normal equations and count pixels; each point stands for `share`."""
     noise = params.pixel_noise**2
     var_I = scales.intensity**2 + noise * (rows.grey_gradient**2).sum(axis=1)
     var_D = scales.inverse_depth**2 + noise * (rows.depth_gradient**2).sum(axis=1)
@@ -324,14 +336,14 @@ def _totals(
     reference = points.p_static >= 0.5
     median_I, median_D = _medians(rows, params)
     return {
-        'information': information,
-        'gradient': gradient,
-        'cost': float((weight * squared).sum()),
-        'weight': float((weight * (1 + rows.has_depth)).sum()),
-        'compared': int(compared.sum()),
-        'inliers': int((compared & agree & same).sum()),
-        'reference': int(reference.sum()),
-        'in_view': int((reference & rows.seen).sum()),
+        'information': share * information,
+        'gradient': share * gradient,
+        'cost': share * float((weight * squared).sum()),
+        'weight': share * float((weight * (1 + rows.has_depth)).sum()),
+        'compared': int(share * compared.sum() + 0.5),
+        'inliers': int(share * (compared & agree & same).sum() + 0.5),
+        'reference': int(share * reference.sum() + 0.5),
+        'in_view': int(share * (reference & rows.seen).sum() + 0.5),
         'median_intensity': median_I,
         'median_inverse_depth': median_D,
     }
@@ -351,11 +363,11 @@ def normal_equations(
     params: Params,
 ) -> dict[str, Any]:
     """Return `information`, shape (11, 11), and `gradient`, shape (11,), at one pose."""
-    points = collect_points(reference, reference_level)
+    points, share = spread(collect_points(reference, reference_level), params)
     level = current.level(current_level)
     appearance = Appearance(np.array([gain, bias, *pattern]))
     rows = linearise(points, level, T, current.sweep, appearance)
-    return _totals(points, level, rows, Scales(intensity_scale, inverse_depth_scale), params)
+    return _totals(points, share, rows, Scales(intensity_scale, inverse_depth_scale), params)
 
 
 def _step(
@@ -408,7 +420,8 @@ def align(
     prior = None if T_prior is None or information is None else (T_prior, information)
     left, done, converged, scales = params.max_iterations, 0, False, Scales()
     for index, (i, j) in enumerate(pairs):
-        points, level = collect_points(reference, i), current.level(j)
+        points, share = spread(collect_points(reference, i), params)
+        level = current.level(j)
         finer = len(pairs) - index - 1
         budget = min(left, max(2, left - _RESERVED * finer))
         stop = params.stop_px * (_COARSE_STOP if finer else 1.0)
@@ -417,17 +430,16 @@ def align(
         while budget > 0 and not converged:
             rows = linearise(points, level, T, current.sweep, appearance)
             step = _step(
-                _totals(points, level, rows, scales, params), T, appearance, prior, params
+                _totals(points, share, rows, scales, params), T, appearance, prior, params
             )
             T = se3.orthonormalise(se3.exp(step[:6]) @ T)
             appearance = Appearance(appearance.values + step[6:])
             scales = _scales(rows, params)
             converged = _step_px(step, level) < stop
             budget, left, done = budget - 1, left - 1, done + 1
-    points, level = collect_points(reference, pairs[-1][0]), current.level(pairs[-1][1])
     rows = linearise(points, level, T, current.sweep, appearance)
     return {
-        **_totals(points, level, rows, scales, params),
+        **_totals(points, share, rows, scales, params),
         'T': T,
         'gain': float(appearance.values[0]),
         'bias': float(appearance.values[1]),

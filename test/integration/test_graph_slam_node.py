@@ -70,6 +70,9 @@ def test_a_recording_to_its_end(
     if mode == 'lockstep':
         check_same(read_trajectory(out / 'trajectory.txt'), offline)
         assert metrics['frames_missed']['value'] == 0
+    else:
+        assert metrics['frames_dropped']['value'] == 0
+        assert metrics['frames_in']['value'] == len(offline)
 
 
 def check_same(live: Trajectory, offline: Trajectory) -> None:

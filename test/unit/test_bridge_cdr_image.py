@@ -7,12 +7,12 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs rclpy')
 
-from rclpy.serialization import serialize_message  # noqa: E402
-from sensor_msgs.msg import Image  # noqa: E402
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import Image
 
-from bdgs_ros.bridge import conversions  # noqa: E402
-from bdgs_ros.bridge.cdr_image import image_from_cdr  # noqa: E402
-from bdgs_ros.core.errors import DatasetError  # noqa: E402
+from bdgs_ros.bridge import conversions
+from bdgs_ros.bridge.cdr_image import image_from_cdr
+from bdgs_ros.core.errors import DatasetError
 
 
 def message(frame_id: str) -> Image:

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import math
+import os
+import sys
 import threading
 import time
 
+import numpy as np
+import pytest
+
 from bdgs_ros.bridge.acknowledgements import Acknowledgements
+from bdgs_ros.bridge.pace import Pace
 from bdgs_ros.bridge.stamped import Assembler, StampBuffer
 from bdgs_ros.bridge.worker import Worker
 
@@ -119,3 +126,53 @@ def test_acknowledgements_count_what_is_missed() -> None:
     assert (acks.sent, acks.missed, dict(acks.states)) == (3, 1, {'ok': 1, 'lost': 1})
     assert acks.wait(2, 0.0)
     assert not acks.wait(3, 0.01)
+
+
+@pytest.mark.skipif(not sys.platform.startswith('linux'), reason='priorities of threads')
+def test_a_worker_gives_way_and_others_do_not() -> None:
+    before = os.getpriority(os.PRIO_PROCESS, 0)
+    seen: list[int] = []
+    worker: Worker[int] = Worker(
+        lambda _: seen.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id())),
+        lambda error: None,
+        capacity=None,
+        nice=before + 3,
+    )
+    worker.put(0)
+    assert worker.wait_idle(2.0)
+    worker.stop()
+    assert seen == [before + 3]
+    assert os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) == before
+
+
+def test_what_waits_is_counted() -> None:
+    gate = threading.Event()
+    worker: Worker[int] = Worker(lambda _: gate.wait(2.0), lambda error: None, capacity=None)
+    worker.put(0)
+    while not worker._busy:
+        time.sleep(0.001)
+    assert worker.waiting == 0
+    worker.put(1)
+    assert worker.waiting == 1
+    gate.set()
+    worker.stop()
+
+
+@pytest.mark.parametrize(('rate_hz', 'chosen'), [(15, 150), (10, 100), (30, 300), (math.inf, 300)])
+def test_a_pace_chooses_evenly(rate_hz: float, chosen: int) -> None:
+    rng = np.random.default_rng(0)
+    stamps = (np.arange(300) / 30 * 1e9 + rng.uniform(-2e6, 2e6, 300)).astype(int)
+    pace = Pace(rate_hz)
+    kept = [stamp for stamp in stamps.tolist() if pace.is_due(stamp)]
+    assert len(kept) == chosen
+    assert max(np.diff(kept)) < 1.1e9 / min(rate_hz, 30) + 4e6
+
+
+def test_a_pace_goes_on_after_a_gap() -> None:
+    pace = Pace(10)
+    assert pace.is_due(0)
+    assert not pace.is_due(30_000_000)
+    assert pace.is_due(5_000_000_000)
+    assert not pace.is_due(5_020_000_000)
+    pace.reset()
+    assert pace.is_due(0)

@@ -87,6 +87,15 @@ def test_fewer_iterations_where_the_coarse_ones_gain_nothing() -> None:
     assert len(Optimiser(hasty).run(gaussians, keyframe, [])) == len(coarse) + 2
 
 
+def test_in_a_hurry_few_fine_iterations_follow_the_coarse_ones() -> None:
+    gaussians, keyframe = scene()
+    config = replace(CONFIG, enough=-1e9, hurried_fine=3)
+    hurried = iter([False, False, True])
+    optimiser = Optimiser(config, lambda: next(hurried))
+    coarse, _ = optimiser._plan(keyframe, [])
+    assert len(optimiser.run(gaussians, keyframe, [])) == len(coarse) + 3 + 2
+
+
 def test_windows_cover_a_large_image() -> None:
     _, keyframe = scene()
     level = keyframe.levels[0]

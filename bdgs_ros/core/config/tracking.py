@@ -63,6 +63,9 @@ class AlignConfig:
     min_static: float = param(
         0.25, 'P(static) of both pixels together to count as compared', low=0.0, high=1.0
     )
+    max_points: int = param(
+        20000, 'compared per level: about so many of more, in rows spread evenly', low=256
+    )
     backend: str = param('auto', 'kernel', choices=('auto', 'native', 'numpy'))
 
 

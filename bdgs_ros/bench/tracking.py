@@ -1,0 +1,211 @@
+"""Bench `tracking`: what a frame costs and where, alone and live beside the other nodes."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bdgs_ros.bench import sequences
+from bdgs_ros.bench.harness import Cell, Options
+from bdgs_ros.bench.sequences import REAL
+from bdgs_ros.bench.tracking_parts import PARTS, PartTimes
+from bdgs_ros.core.errors import BdgsError
+from bdgs_ros.core.types import StampedPose, TrackingStatus, Trajectory
+
+NAME = 'tracking'
+PROTOCOL = """
+alone: every frame goes through the pipeline in order, and the time of tracking alone is taken;
+detection and mapping run between the frames, not beside them. load is reading and decoding the
+frame from its files and no part of tracking. live: slam_node starts detection, tracking and
+mapping in processes of their own and replays the recording over DDS in real time, at the rate of
+its stamps; nobody waits for anybody. tracked_percent: frames with a pose over frames sent; dropped
+are those that tracking had no time for; latency: from the arrival of the later of both images to
+the pose; labels_age: how much older the labels are that a frame is tracked with; keyframes_mapped:
+of the keyframes found. ATE over the frames with a pose, online, as in bench slam.
+"""
+TABLES = {
+    'Alone': (
+        *('sequence', 'configuration', 'frames', 'ate_rmse_cm', 'tracking_ms', 'tracking_p95_ms'),
+        *(f'{part}_ms' for part in ('load', *PARTS, 'rest')),
+    ),
+    'Live': (
+        *('sequence', 'configuration', 'frames', 'tracked_percent', 'dropped', 'lost'),
+        *('ate_rmse_cm', 'ate_max_cm', 'tracking_ms', 'tracking_p95_ms', 'latency_ms'),
+        *('latency_p95_ms', 'labels_age_ms', 'labels', 'keyframes', 'keyframes_mapped'),
+        'mapping_ms',
+    ),
+}
+
+_SYNTH = 'walking_xyz'
+_LIVE_TIMEOUT_S = 300.0
+_CAMERA_HZ = 30.0
+_LIVE_COLUMNS = {
+    'frames': 'frames_sent',
+    'dropped': 'frames_dropped',
+    'lost': 'frames_lost',
+    'ate_rmse_cm': 'ate_rmse',
+    'ate_max_cm': 'ate_max',
+    'tracking_ms': 'tracking_median',
+    'tracking_p95_ms': 'tracking_p95',
+    'latency_ms': 'image_to_pose_median',
+    'latency_p95_ms': 'image_to_pose_p95',
+    'keyframes': 'keyframes',
+    'mapping_ms': 'mapping_median',
+}
+_NODE_COLUMNS = {
+    'labels_age_ms': ('tracking', 'labels_age_ms_median'),
+    'labels': ('detection', 'labels'),
+    'keyframes_mapped': ('mapping', 'keyframes'),
+}
+
+
+def cells(options: Options) -> list[Cell]:
+    """List each recording alone and live; several seeds are repetitions of the live ones."""
+    common = sequences.detector_settings('weights', options)
+    real = {**sequences.real_settings(options), **common}
+    synth = {**sequences.synth_settings(options), **common}
+    chosen = [(sequence.name, real) for sequence in REAL]
+    chosen.append((sequences.synth_name(_SYNTH), synth))
+    found = []
+    for name, settings in chosen:
+        found.append(Cell(name, 'alone', 0, settings))
+        found += [Cell(name, 'live', seed, settings) for seed in options.seeds]
+    return found
+
+
+def run_cell(cell: Cell, options: Options) -> dict[str, Any]:
+    """Measure one recording, one way."""
+    recording = sequences.cell_recording(_first_seed(cell), options)
+    if cell.configuration == 'alone':
+        return _alone(recording, cell, options)
+    return _live(recording, cell, options)
+
+
+def _first_seed(cell: Cell) -> Cell:
+    return Cell(cell.sequence, cell.configuration, 0, cell.settings)
+
+
+def _alone(recording: Path, cell: Cell, options: Options) -> dict[str, Any]:
+    from bdgs_ros.data.layouts import open_sequence
+    from bdgs_ros.eval.trajectory import ate
+    from bdgs_ros.pipeline import BdgsSlam
+
+    sequence: Any = open_sequence(recording)
+    slam = BdgsSlam(sequences.config_of(options.values, True, options))
+    rows: list[dict[str, float]] = []
+    poses = []
+    with PartTimes() as times:
+        count = sequences.frame_limit(cell) or len(sequence)
+        for index in range(count):
+            start = time.perf_counter()
+            frame = sequence[index]
+            load_ms = 1e3 * (time.perf_counter() - start)
+            result = slam.process(frame).tracking
+            rows.append({'load': load_ms, **times.take()})
+            if result.status is TrackingStatus.OK:
+                poses.append(StampedPose(result.stamp_ns, result.T_world_camera))
+    errors = ate(sequence.ground_truth, Trajectory(tuple(poses))).statistics
+    return {'frames': count, 'ate_rmse_cm': 100 * errors.rmse, **part_columns(rows)}
+
+
+def part_columns(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Return the median of every part over frames, and of the whole also the 95th percentile."""
+    names = ('load', *PARTS)
+    times = {name: np.array([row.get(name, 0.0) for row in rows]) for name in (*names, 'all')}
+    rest = times['all'] - sum(times[name] for name in PARTS)
+    columns = {f'{name}_ms': float(np.median(times[name])) for name in names}
+    columns['rest_ms'] = float(np.median(rest))
+    columns['tracking_ms'] = float(np.median(times['all']))
+    columns['tracking_p95_ms'] = float(np.percentile(times['all'], 95))
+    return columns
+
+
+def _live(recording: Path, cell: Cell, options: Options) -> dict[str, Any]:
+    bag = _bag(recording, cell, options)
+    output = options.work / 'runs' / cell.key
+    output.mkdir(parents=True, exist_ok=True)
+    values = {
+        'bag': bag.resolve(),
+        'output': output.resolve(),
+        'exit_at_end': 'true',
+        'mode': 'realtime',
+        'detection.weights': sequences.weights_path(options).resolve(),
+        **options.values,
+    }
+    _run_graph(values, output / 'log.txt')
+    return live_columns(json.loads((output / 'metrics.json').read_text(encoding='utf-8')))
+
+
+def _bag(recording: Path, cell: Cell, options: Options) -> Path:
+    """Return the recording as a bag, converted now if it was not yet."""
+    from bdgs_ros.data.convert import ConvertOptions, convert
+
+    limit = sequences.frame_limit(cell)
+    bag = options.work / 'bags' / f'{recording.name}{"" if limit is None else f"_{limit}"}'
+    if not (bag / 'metadata.yaml').is_file():
+        duration_s = None if limit is None else limit / _CAMERA_HZ
+        convert(recording, bag, ConvertOptions(duration_s=duration_s))
+    return bag
+
+
+def _run_graph(values: Mapping[str, Any], log: Path) -> None:
+    command = [sys.executable, '-m', 'bdgs_ros.nodes.slam_node', '--ros-args']
+    for name, value in values.items():
+        command += ['-p', f'{name}:={value}']
+    domain = os.environ.get('ROS_DOMAIN_ID', str(10 + os.getpid() % 90))
+    environment = {
+        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+        **os.environ,
+        'ROS_DOMAIN_ID': domain,
+    }
+    with log.open('wb') as file:
+        try:
+            subprocess.run(
+                command,
+                env=environment,
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                timeout=_LIVE_TIMEOUT_S,
+                check=True,
+            )
+        except subprocess.SubprocessError as error:
+            raise BdgsError(f"the graph did not end well ({error}); see '{log}'") from error
+
+
+def live_columns(metrics: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the columns of a live row from the `metrics.json` of slam_node."""
+    found = {name: entry['value'] for name, entry in metrics['metrics'].items()}
+    row = {column: found[name] for column, name in _LIVE_COLUMNS.items() if name in found}
+    for column, (node, name) in _NODE_COLUMNS.items():
+        text = metrics['nodes'].get(node, {}).get(name)
+        if text is not None:
+            row[column] = float(text)
+    row['tracked_percent'] = 100.0 * found['frames'] / max(found['frames_sent'], 1)
+    return row
+
+
+def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the medians over repetitions of what is promised: time, share, latency, error."""
+    summary: dict[str, Any] = {}
+    columns = (
+        'tracking_ms',
+        'tracking_p95_ms',
+        'tracked_percent',
+        'latency_p95_ms',
+        'ate_rmse_cm',
+    )
+    for key in dict.fromkeys((row['sequence'], row['configuration']) for row in rows):
+        own = [row for row in rows if (row['sequence'], row['configuration']) == key]
+        for column in columns:
+            values = [row[column] for row in own if row.get(column) is not None]
+            if values:
+                summary[f'{key[0]}_{key[1]}_{column}'] = float(np.median(values))
+    return summary
