@@ -62,7 +62,9 @@ def test_switched_off_it_returns_the_last_pose() -> None:
 def test_plain_velocity_repeats_the_last_motion() -> None:
     predictor = MotionPredictor(MotionConfig(model='velocity'))
     follow(predictor, 2)
-    assert np.abs(error_of(predictor, 2)).max() < 1e-9  # two poses are enough, where a filter learns
+    assert (
+        np.abs(error_of(predictor, 2)).max() < 1e-9
+    )  # two poses are enough, where a filter learns
     kalman = MotionPredictor(MotionConfig())
     follow(kalman, 2)
     assert np.abs(error_of(kalman, 2)).max() > 1e-6
