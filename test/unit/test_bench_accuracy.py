@@ -22,6 +22,7 @@ def test_the_whole_method_has_five_seeds_and_each_switch_two(options):
     assert len(set(labels)) == len(labels)
     for scenario in scenarios():
         assert sum(label.startswith(f'synth_{scenario}/weights/') for label in labels) == 5
+    for scenario in ('static', 'walking_rpy', 'crowd'):
         assert sum(label.startswith(f'synth_{scenario}/no_masks/') for label in labels) == 2
     assert {'bonn_crowd_part/weights/0', 'fr1_rpy_part/plain_velocity/0'} <= set(labels)
 

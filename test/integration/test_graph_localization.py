@@ -1,0 +1,141 @@
+"""Localisation mode: the map stays as it is, and is shown wherever the camera is."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='needs rclpy')
+pytestmark = [pytest.mark.ros, pytest.mark.slow]
+
+from graph_processes import Graph  # noqa: E402
+from sensor_msgs.msg import Image  # noqa: E402
+
+from bdgs_ros.bridge import conversions, topics  # noqa: E402
+from bdgs_ros.core.config import BdgsConfig, with_values  # noqa: E402
+from bdgs_ros.core.types import StampedPose, TrackingStatus, Trajectory  # noqa: E402
+from bdgs_ros.data.bag_recording import BagSequence  # noqa: E402
+from bdgs_ros.data.trajectory_io import POSE_COLUMNS, read_trajectory  # noqa: E402
+from bdgs_ros.pipeline import BdgsSlam  # noqa: E402
+
+HALF = 10  # frames that the map is made of
+
+
+@pytest.fixture(scope='module')
+def made(bag: Path, settings: dict[str, object], tmp_path_factory) -> tuple[Path, StampedPose]:
+    """Map the first half of the recording; return the map and where the camera was at the end."""
+    folder = tmp_path_factory.mktemp('map')
+    slam = BdgsSlam(config_of(settings))
+    sequence = BagSequence(bag)
+    last = [slam.process(sequence[i]).tracking for i in range(HALF)][-1]
+    slam.mapper.save(folder / 'map.ply')
+    return folder / 'map.ply', StampedPose(last.stamp_ns, last.T_world_camera)
+
+
+def config_of(settings: dict[str, object]) -> BdgsConfig:
+    return with_values(BdgsConfig(), {n.replace('__', '.'): v for n, v in settings.items()})
+
+
+def files_of(map_file: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(map_file.parent)): path.read_bytes()
+        for path in map_file.parent.rglob('*')
+        if path.is_file()
+    }
+
+
+def as_text(pose: StampedPose, folder: Path) -> str:
+    from bdgs_ros.data.trajectory_io import write_trajectory
+
+    write_trajectory(folder / 'start.txt', Trajectory((pose,)))
+    return (folder / 'start.txt').read_text().splitlines()[1].split(' ', 1)[1]
+
+
+def localised(bag: Path, made: tuple[Path, StampedPose], settings: dict[str, object]) -> Trajectory:
+    """Localise without ROS, starting where the first half ended."""
+    sequence = BagSequence(bag)
+    slam = BdgsSlam(config_of(settings))
+    slam.start_from(made[0], sequence.camera, made[1].T_world_camera, localise=True)
+    results = [slam.process(sequence[i]).tracking for i in range(HALF, len(sequence))]
+    return Trajectory(
+        tuple(
+            StampedPose(r.stamp_ns, r.T_world_camera)
+            for r in results
+            if r.status is TrackingStatus.OK
+        )
+    )
+
+
+def test_localising_in_a_saved_map(
+    graph: Graph,
+    ros: Callable,
+    bag: Path,
+    made: tuple[Path, StampedPose],
+    settings: dict[str, object],
+    tmp_path: Path,
+) -> None:
+    map_file, start = made
+    before = files_of(map_file)
+    expected = localised(bag, made, settings)
+    assert files_of(map_file) == before
+    assert len(expected) == len(BagSequence(bag)) - HALF
+    shown: dict[str, dict[int, Image]] = {}
+    with ros() as me:
+        for topic in (topics.RENDERED_IMAGE, topics.RENDERED_DEPTH, topics.DYNAMIC_PROBABILITY):
+            found = shown.setdefault(topic, {})
+            me.create_subscription(
+                Image,
+                topic,
+                lambda message, found=found: found.update(
+                    {conversions.stamp_ns(message): message}
+                ),
+                topics.RELIABLE,
+            )
+        out = tmp_path / 'out'
+        slam = graph.node(
+            'slam_node', bag=bag, output=out, exit_at_end=True, mode='lockstep',
+            map_file=map_file, localization=True, start=seconds_in(bag, HALF),
+            start_pose=f'"{as_text(start, tmp_path)}"', **settings,
+        )  # fmt: skip
+        assert slam.wait(120.0) == 0, slam.text()
+    live = read_trajectory(out / 'trajectory.txt')
+    assert live.stamps_ns.tolist() == expected.stamps_ns.tolist()
+    assert live.positions == pytest.approx(expected.positions, abs=1e-4)
+    assert len(read_trajectory(out / 'trajectory_final.txt')) == len(live)
+    for topic, images in shown.items():
+        assert set(images) <= set(live.stamps_ns.tolist())
+        assert len(images) >= 0.8 * len(live), topic
+    (image, *_) = shown[topics.RENDERED_IMAGE].values()
+    assert (image.width, image.height, image.encoding) == (160, 120, 'rgb8')
+    assert np.frombuffer(image.data, np.uint8).mean() > 20
+    # the map of the user is as it was, and no other was written
+    assert files_of(map_file) == before
+    assert not (out / 'map.ply').exists()
+    metrics = json.loads((out / 'metrics.json').read_text())['metrics']
+    assert metrics['frames_lost']['value'] == 0
+    assert metrics['ate_final_rmse']['value'] < 2.0
+
+
+def seconds_in(bag: Path, index: int) -> float:
+    """Return how far into the recording a frame is, a little early."""
+    stamps = [frame.stamp_ns for frame in BagSequence(bag)]
+    return (stamps[index] - stamps[0]) * 1e-9 - 0.005
+
+
+def test_there_must_be_a_map_to_localise_in(graph: Graph, tmp_path: Path) -> None:
+    slam = graph.node('slam_node', localization=True)
+    assert slam.wait(30.0) == 2
+    assert "need 'map_file'" in slam.text()
+    mapping = graph.node('mapping_node', localization=True, map_file=tmp_path / 'none.ply')
+    assert mapping.wait(30.0) == 2
+    assert 'none.ply' in mapping.text()
+
+
+def test_a_start_pose_is_a_pose(graph: Graph) -> None:
+    mapping = graph.node('mapping_node', start_pose='"1 2 3"')
+    assert mapping.wait(30.0) == 2
+    assert f"3 numbers for the pose '{POSE_COLUMNS}'" in mapping.text()
