@@ -60,7 +60,7 @@ _COLUMNS = {
 
 
 def cells(options: Options) -> list[Cell]:
-    """List the whole method everywhere, then each switch on the real recordings and some synthetic."""
+    """List the whole method everywhere, then each switch on the real and some synthetic ones."""
     from bdgs_ros.data.synth import scenarios
 
     names = _QUICK_SCENARIOS if options.quick else tuple(scenarios())

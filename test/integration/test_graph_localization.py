@@ -55,7 +55,9 @@ def as_text(pose: StampedPose, folder: Path) -> str:
     return (folder / 'start.txt').read_text().splitlines()[1].split(' ', 1)[1]
 
 
-def localised(bag: Path, made: tuple[Path, StampedPose], settings: dict[str, object]) -> Trajectory:
+def localised(
+    bag: Path, made: tuple[Path, StampedPose], settings: dict[str, object]
+) -> Trajectory:
     """Localise without ROS, starting where the first half ended."""
     sequence = BagSequence(bag)
     slam = BdgsSlam(config_of(settings))

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import signal
 import threading
 import time
+
+import pytest
 
 from bdgs_ros.bridge.acknowledgements import Acknowledgements
 from bdgs_ros.bridge.stamped import Assembler, StampBuffer
@@ -119,3 +122,30 @@ def test_acknowledgements_count_what_is_missed() -> None:
     assert (acks.sent, acks.missed, dict(acks.states)) == (3, 1, {'ok': 1, 'lost': 1})
     assert acks.wait(2, 0.0)
     assert not acks.wait(3, 0.01)
+
+
+def test_signals_are_counted_without_a_lock() -> None:
+    pytest.importorskip('rclpy', reason='needs rclpy')
+    from bdgs_ros.bridge import runner
+
+    before = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        received = runner._catch_signals()
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGTERM):
+            signal.raise_signal(number)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    assert received == [signal.SIGTERM, signal.SIGINT, signal.SIGTERM]
+
+
+def test_a_worker_that_is_woken_calls_idle_at_once() -> None:
+    idle = threading.Event()
+    worker: Worker[int] = Worker(
+        lambda item: None, lambda error: None, None, idle.set, idle_period_s=30.0
+    )
+    time.sleep(0.05)
+    assert not idle.is_set()
+    worker.wake()
+    assert idle.wait(2.0)
+    worker.stop()
