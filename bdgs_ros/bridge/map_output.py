@@ -59,8 +59,8 @@ class MapOutput:
         self._map_version = -1
 
     def see_through(self, camera: PinholeCamera, frame_id: str) -> None:
-        """Render with the camera of the images, at the map's size, from now on."""
-        width = min(self._config.mapping.width, camera.width)
+        """Render with the camera of the images, at the size asked for, from now on."""
+        width = min(self._config.render_width, self._config.mapping.width, camera.width)
         self._camera = camera.scaled(width / camera.width), frame_id
 
     def note_pose(self, message: PoseStamped, *, frozen: bool) -> None:

@@ -126,6 +126,9 @@ class MappingNodeConfig(GraphConfig):
         low=0.0,
         high=1000.0,
     )
+    render_width: int = param(
+        320, 'of bdgs/rendered, and mapping.width at most', unit='px', low=20, high=4096
+    )
     map_period_s: float = param(2.0, 'between two messages of bdgs/map', unit='s', low=0.0)
     keyframe_queue: int = param(
         2, 'keyframes that may wait for mapping (realtime)', low=1, high=1000

@@ -117,6 +117,8 @@ class SlamNode(GraphNode):
         values = dict(child.values)
         if child.name == 'mapping_node' and self._has_saved_map(values):
             values['load_at_start'] = True
+        if child.name == 'tracking_node':  # mapping shows it the map from where it was last
+            values['load_at_start'] = True
         self._children.start(child.name, values)
 
     def _has_saved_map(self, values: dict[str, object]) -> bool:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,8 +15,11 @@ import pytest
 pytest.importorskip('rclpy', reason='needs rclpy')
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 
-from graph_processes import Graph  # noqa: E402
-from sensor_msgs.msg import Image  # noqa: E402
+from geometry_msgs.msg import PoseStamped  # noqa: E402
+from graph_processes import Graph, Running  # noqa: E402
+from rclpy.node import Node  # noqa: E402
+from sensor_msgs.msg import CameraInfo, Image  # noqa: E402
+from std_srvs.srv import Trigger  # noqa: E402
 
 from bdgs_ros.bridge import conversions, topics  # noqa: E402
 from bdgs_ros.core.config import BdgsConfig, with_values  # noqa: E402
@@ -126,6 +132,63 @@ def seconds_in(bag: Path, index: int) -> float:
     """Return how far into the recording a frame is, a little early."""
     stamps = [frame.stamp_ns for frame in BagSequence(bag)]
     return (stamps[index] - stamps[0]) * 1e-9 - 0.005
+
+
+def test_tracking_that_died_comes_back_into_its_world(
+    graph: Graph, ros: Callable, bag: Path, offline: Trajectory, settings: dict[str, object]
+) -> None:
+    found: dict[int, np.ndarray] = {}
+    slam = graph.node(
+        'slam_node', bag=bag, mode='lockstep', paused=True, lockstep_timeout_s=5.0,
+        **settings,
+    )  # fmt: skip
+    slam.wait_for('playing', 90.0)
+
+    def keep(message: PoseStamped) -> None:
+        pose = conversions.pose_from_message(message.pose)
+        found[conversions.stamp_ns(message)] = pose[:3, 3]
+
+    def play(steps: int, node: Node) -> None:
+        client = node.create_client(Trigger, topics.REPLAY_STEP)
+        assert client.wait_for_service(20.0)
+        for _ in range(steps):
+            before, deadline = len(found), time.monotonic() + 7
+            client.call_async(Trigger.Request())
+            # a frame sent before its reader is discovered is lost, and replay goes on after 5 s
+            while len(found) == before and time.monotonic() < deadline:
+                time.sleep(0.01)
+
+    with ros() as me:
+        me.create_subscription(PoseStamped, topics.POSE, keep, topics.RELIABLE)
+        info: list[CameraInfo] = []
+        me.create_subscription(CameraInfo, topics.COLOR_INFO, info.append, topics.RELIABLE)
+        camera = me.create_publisher(CameraInfo, topics.COLOR_INFO, topics.RELIABLE)
+        play(HALF, me)
+        os.kill(pid_of(slam, 'tracking_node'), signal.SIGKILL)
+        deadline = time.monotonic() + 30
+        while slam.text().count('tracking is ready') < 2:
+            assert time.monotonic() < deadline, slam.text()
+            time.sleep(0.1)
+        while camera.get_subscription_count() < 4:  # detection, tracking, mapping, this test
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        camera.publish(info[0])  # the recording's last one came to the dead process
+        play(len(offline) - HALF, me)
+    stamps = offline.stamps_ns.tolist()
+    assert set(stamps[:HALF]) <= set(found)
+    after = [k for k in range(HALF, len(stamps)) if stamps[k] in found]
+    assert len(after) >= 0.7 * HALF, slam.text()
+    expected = offline.positions[after]
+    assert np.linalg.norm(expected, axis=1).min() > 0.01  # not the origin
+    live = np.array([found[stamps[k]] for k in after])
+    assert live == pytest.approx(expected, abs=0.005)
+
+
+def pid_of(slam: Running, name: str) -> int:
+    pid = slam.process.pid
+    children = Path(f'/proc/{pid}/task/{pid}/children').read_text().split()
+    (found,) = (c for c in children if name in Path(f'/proc/{c}/cmdline').read_text())
+    return int(found)
 
 
 def test_there_must_be_a_map_to_localise_in(graph: Graph, tmp_path: Path) -> None:
