@@ -166,7 +166,9 @@ class SlamConfig(GraphConfig):
     """Parameters of slam_node itself; it hands everything else to the nodes it starts."""
 
     bag: str = param('', 'recording to replay through the graph; empty: wait for a camera')
-    output: str = param('', 'folder for trajectory.txt, map.ply and metrics.json')
+    output: str = param(
+        '', 'folder for trajectory.txt, trajectory_final.txt, map.ply and metrics.json'
+    )
     exit_at_end: bool = param(False, 'write the results and stop when the recording is over')
     processes: str = param(
         'several',

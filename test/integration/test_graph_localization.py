@@ -29,6 +29,7 @@ from bdgs_ros.data.trajectory_io import POSE_COLUMNS, read_trajectory  # noqa: E
 from bdgs_ros.pipeline import BdgsSlam  # noqa: E402
 
 HALF = 10  # frames that the map is made of
+DEATH = 16  # frames until tracking is killed: the camera is 2 cm from the origin then
 
 
 @pytest.fixture(scope='module')
@@ -69,6 +70,9 @@ def localised(
     slam = BdgsSlam(config_of(settings))
     slam.start_from(made[0], sequence.camera, made[1].T_world_camera, localise=True)
     results = [slam.process(sequence[i]).tracking for i in range(HALF, len(sequence))]
+    again = made[0].parent.parent / 'again.ply'
+    slam.mapper.save(again)
+    assert again.read_bytes() == made[0].read_bytes()  # in memory too the map is as it was
     return Trajectory(
         tuple(
             StampedPose(r.stamp_ns, r.T_world_camera)
@@ -163,7 +167,7 @@ def test_tracking_that_died_comes_back_into_its_world(
         info: list[CameraInfo] = []
         me.create_subscription(CameraInfo, topics.COLOR_INFO, info.append, topics.RELIABLE)
         camera = me.create_publisher(CameraInfo, topics.COLOR_INFO, topics.RELIABLE)
-        play(HALF, me)
+        play(DEATH, me)
         os.kill(pid_of(slam, 'tracking_node'), signal.SIGKILL)
         deadline = time.monotonic() + 30
         while slam.text().count('tracking is ready') < 2:
@@ -173,13 +177,13 @@ def test_tracking_that_died_comes_back_into_its_world(
             assert time.monotonic() < deadline
             time.sleep(0.1)
         camera.publish(info[0])  # the recording's last one came to the dead process
-        play(len(offline) - HALF, me)
+        play(len(offline) - DEATH, me)
     stamps = offline.stamps_ns.tolist()
-    assert set(stamps[:HALF]) <= set(found)
-    after = [k for k in range(HALF, len(stamps)) if stamps[k] in found]
-    assert len(after) >= 0.7 * HALF, slam.text()
+    assert set(stamps[:DEATH]) <= set(found)
+    after = [k for k in range(DEATH, len(stamps)) if stamps[k] in found]
+    assert len(after) >= 2, slam.text()
     expected = offline.positions[after]
-    assert np.linalg.norm(expected, axis=1).min() > 0.01  # not the origin
+    assert np.linalg.norm(expected, axis=1).min() > 0.015  # a new world would show
     live = np.array([found[stamps[k]] for k in after])
     assert live == pytest.approx(expected, abs=0.005)
 
