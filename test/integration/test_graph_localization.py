@@ -69,10 +69,12 @@ def localised(
     sequence = BagSequence(bag)
     slam = BdgsSlam(config_of(settings))
     slam.start_from(made[0], sequence.camera, made[1].T_world_camera, localise=True)
+    copies = [made[0].parent.parent / f'{name}.ply' for name in ('loaded', 'afterwards')]
+    slam.mapper.save(copies[0])
     results = [slam.process(sequence[i]).tracking for i in range(HALF, len(sequence))]
-    again = made[0].parent.parent / 'again.ply'
-    slam.mapper.save(again)
-    assert again.read_bytes() == made[0].read_bytes()  # in memory too the map is as it was
+    slam.mapper.save(copies[1])
+    loaded, afterwards = (copy.read_bytes() for copy in copies)
+    assert afterwards == loaded  # in memory too the map is as it was
     return Trajectory(
         tuple(
             StampedPose(r.stamp_ns, r.T_world_camera)
