@@ -19,6 +19,7 @@ from bdgs_ros.data.synth.truth import SynthTruth
 from bdgs_ros.eval.metric import Metric
 from bdgs_ros.eval.pictures import write_posterior
 from bdgs_ros.eval.posterior import PosteriorWatch
+from bdgs_ros.eval.recorder import Recorder
 from bdgs_ros.eval.scores import Truth
 from bdgs_ros.runner import LabelObserver, Observer, run_sequence, write_results
 
@@ -37,6 +38,8 @@ class Job:
     loop_frames: int | None = None
     """Play the recording forth and back until there are so many; start and frames are of those."""
     pictures: bool = True
+    samples: int = Recorder.max_samples
+    """Frames kept for pictures and for scores of the render; 0 for a run for its poses alone."""
     progress: bool = True
     keyframes: bool = True
     """Whether to leave the images too that the map can be refined with."""
@@ -94,7 +97,10 @@ def run_job(
     start = time.perf_counter()
     watching = [watch for watch in (labels, posterior) if watch is not None]
     result = run_sequence(
-        _with_progress(sequence, chosen, job.progress), slam, [*watching, *observers]
+        _with_progress(sequence, chosen, job.progress),
+        slam,
+        [*watching, *observers],
+        Recorder(job.samples),
     )
     wall_s = time.perf_counter() - start
     metrics = write_results(

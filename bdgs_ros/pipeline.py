@@ -8,14 +8,12 @@ from pathlib import Path
 from bdgs_ros.core import se3
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.config import BdgsConfig
-from bdgs_ros.core.errors import MapError
 from bdgs_ros.core.types import Keyframe, Labels, Pose, RgbdFrame, TrackingResult
 from bdgs_ros.detection.detector import Detector, LateDetector
 from bdgs_ros.detection.stage import DetectionStage
+from bdgs_ros.mapping.entrance import check_entrance, entrance
 from bdgs_ros.mapping.mapper import Mapper
 from bdgs_ros.tracking.camera_tracker import CameraTracker
-
-_LEAST_SEEN = 0.1  # of the view; with less there is nothing to align to
 
 
 @dataclass(frozen=True)
@@ -80,16 +78,8 @@ class BdgsSlam:
         self.mapper.load(map_file)
         self.mapper.history.begin_run()
         self.mapper.frozen = localise
-        rectified = camera.rectified()
-        small = rectified.scaled(min(1.0, self._map_width / camera.width))
-        view = self.mapper.view(0, start, small)
-        seen = float((view.depth_m > 0).mean())
-        if seen < _LEAST_SEEN:
-            position = ', '.join(f'{x:.2f}' for x in start[:3, 3])
-            raise MapError(
-                f"'{map_file}' covers {100 * seen:.0f} % of the view from the start pose at "
-                f'({position}) m; give another start pose'
-            )
+        view = entrance(self.mapper, start, camera.rectified(), self._map_width)
+        check_entrance(view, map_file)
         self.tracker.start_from(view)
 
     def process(self, frame: RgbdFrame) -> FrameResult:

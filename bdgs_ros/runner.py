@@ -144,6 +144,7 @@ def write_results(
     *,
     name: str = '',
     ground_truth: Trajectory | None = None,
+    final: Trajectory | None = None,
     truth: scores.Truth | None = None,
     more: Sequence[Metric] = (),
     config: BdgsConfig | None = None,
@@ -172,6 +173,8 @@ def write_results(
         Of the recording, for titles.
     ground_truth : Trajectory, optional
         For ATE and RPE.
+    final : Trajectory, optional
+        With what mapping found out later; by default what the map says.
     truth : Truth, optional
         Static views of a synthetic recording.
     more : sequence of Metric
@@ -215,11 +218,12 @@ def write_results(
         if save_map:
             static_map.save(folder / 'map.ply', keyframes=keep_keyframes)
         found += map_metrics(folder / 'map.ply')
-        final = static_map.final_trajectory(est)
-        write_trajectory(folder / 'trajectory_final.txt', final)
-        found += _final_metrics(final, ground_truth, ate)
+        final = static_map.final_trajectory(est) if final is None else final
         views = scores.render_samples(result.samples, static_map)
         found += scores.render_metrics(views, truth)
+    if final is not None:
+        write_trajectory(folder / 'trajectory_final.txt', final)
+        found += _final_metrics(final, ground_truth, ate)
     if with_pictures:
         _draw(folder, est, views, ground_truth, ate, name)
     metrics = metrics_document(name, found, config, {**(extra or {}), 'notes': notes})

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections import OrderedDict
 from typing import TypeVar
 
 from rclpy.node import Node
 from sensor_msgs.msg import Image
+from std_msgs.msg import Bool, Empty
 
 from bdgs_ros.bridge import conversions, topics
 from bdgs_ros.bridge.cdr_image import CdrImage, image_from_cdr
@@ -16,7 +19,7 @@ from bdgs_ros.bridge.node_config import TrackingNodeConfig
 from bdgs_ros.bridge.stamped import StampBuffer
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.errors import DatasetError
-from bdgs_ros.core.types import Labels, ModelView, RgbdFrame, TrackingResult
+from bdgs_ros.core.types import NO_KEYFRAME_NS, Labels, ModelView, RgbdFrame, TrackingResult
 from bdgs_ros.data.trajectory_io import seconds_to_ns
 
 Item = TypeVar('Item')
@@ -24,6 +27,7 @@ Item = TypeVar('Item')
 _LABELS_KEPT = 30
 _MODELS_KEPT = 4
 _KEYFRAMES_KEPT = 300
+_ASK_PERIOD_S = 1.0
 _ABSENT_S = 1.0
 _FIRST_ABSENT_S = 5.0  # the first message can be later than the discovery of its publisher
 
@@ -54,14 +58,56 @@ class Feedback:
         self._models: StampBuffer[tuple[int, ModelMessages]] = StampBuffer(_MODELS_KEPT)
         self._heard: set[str] = set()
         self._keyframes: OrderedDict[int, PinholeCamera] = OrderedDict()
+<<<<<<< HEAD
         node.create_subscription(Image, topics.LABELS, self._keep_labels, topics.KEPT, raw=True)
+=======
+        self._asked_s = -math.inf
+        self._map_is_frozen = config.localization
+        self._request = node.create_publisher(Empty, topics.MAP_REQUEST, topics.RELIABLE)
+        node.create_subscription(Bool, topics.LOCALIZATION, self._on_localization, topics.LATCHED)
+        node.create_subscription(
+            Image,
+            topics.LABELS,
+            lambda message: self._labels.put(conversions.stamp_ns(message), message),
+            topics.KEPT,
+        )
+>>>>>>> h3
         self._subscription = ModelSubscription(
             node, lambda stamp_ns, found: self._models.put(stamp_ns, (stamp_ns, found))
         )
 
+<<<<<<< HEAD
     def _keep_labels(self, message: bytes) -> None:
         image = image_from_cdr(message)
         self._labels.put(conversions.stamp_ns(image), image)
+=======
+    def _on_localization(self, message: Bool) -> None:
+        self._map_is_frozen = message.data
+
+    @property
+    def begins_in_map(self) -> bool:
+        """Whether the first frame is to be found in a map that exists."""
+        return self._config.begins_in_map or self._map_is_frozen
+
+    def entrance(self, camera: PinholeCamera) -> tuple[bool, ModelView | None]:
+        """
+        Return whether mapping has answered, and the view of its map if it has one.
+
+        Mapping is asked every second until it answers; lockstep waits for the answer.
+        """
+        limit_s = self._config.lockstep_timeout_s if self._config.lockstep else 0.0
+        deadline = time.monotonic() + limit_s
+        while True:
+            now = time.monotonic()
+            if now - self._asked_s >= _ASK_PERIOD_S:
+                self._asked_s = now
+                self._request.publish(Empty())
+            found = self._models.wait(NO_KEYFRAME_NS, min(_ASK_PERIOD_S, max(0.0, deadline - now)))
+            if found is not None or now >= deadline:
+                break
+        self._keyframes[NO_KEYFRAME_NS] = camera
+        return found is not None, None if found is None else self._decode(*found)
+>>>>>>> h3
 
     def labels(self, frame: RgbdFrame) -> Labels | None:
         """Return the labels of a frame, in real time of the newest frame that has any."""
@@ -143,3 +189,4 @@ class Feedback:
         """Forget the models; labels of another time are not found by their stamps anyway."""
         self._models.clear()
         self._keyframes.clear()
+        self._asked_s = -math.inf

@@ -230,6 +230,11 @@ class FrameDecoder:
             raw.stamp_ns, rectifier.color(color), rectifier.depth(depth_m), rectifier.camera
         )
 
+    def camera(self, raw: RawFrame) -> PinholeCamera:
+        """Return the camera of the frame that `decode` would make; raises `DatasetError`."""
+        camera = conversions.camera_from_message(raw.info, self._info_topic)
+        return self._rectifier_of(camera).camera
+
     def _rectifier_of(self, camera: PinholeCamera) -> Rectifier:
         if self._rectifier is None or self._rectifier[0] != camera:
             self._rectifier = (camera, Rectifier(camera))

@@ -58,6 +58,12 @@ class GraphConfig:
     silence_s: float = param(
         3.0, 'a topic silent for longer is warned about', unit='s', low=0.5, high=60.0
     )
+    load_at_start: bool = param(
+        False, 'begin in the map of map_file, if it exists, and go on mapping'
+    )
+    localization: bool = param(
+        False, 'begin in the map of map_file and leave it as it is: localisation alone'
+    )
     qos: QosConfig = field(default_factory=QosConfig)
     sync: SyncConfig = field(default_factory=SyncConfig)
 
@@ -65,6 +71,11 @@ class GraphConfig:
     def lockstep(self) -> bool:
         """Whether nodes wait for each other."""
         return self.mode == 'lockstep'
+
+    @property
+    def begins_in_map(self) -> bool:
+        """Whether tracking starts in a map that exists."""
+        return self.load_at_start or self.localization
 
 
 @dataclass(frozen=True)
@@ -102,10 +113,24 @@ class MappingNodeConfig(GraphConfig):
     map_file: str = param(
         '', 'where bdgs/save_map writes and bdgs/load_map reads; may change at run time'
     )
-    load_at_start: bool = param(False, 'load map_file at the start, if it exists')
+    start_pose: str = param(
+        '',
+        "about where the camera starts in the map of map_file: 'x y z qx qy qz qw' in metres, as "
+        "in the trajectory files; empty: the map's origin",
+    )
+    final_trajectory_file: str = param(
+        '', 'where bdgs/save_final_trajectory writes; may change at run time'
+    )
     autosave_s: float = param(0.0, 'save map_file this often; 0: never', unit='s', low=0.0)
     render_rate: float = param(
-        5.0, 'of bdgs/rendered, while subscribed; 0: never', unit='Hz', low=0.0, high=1000.0
+        5.0,
+        'of bdgs/rendered, while subscribed and the map grows (frozen: every pose); 0: never',
+        unit='Hz',
+        low=0.0,
+        high=1000.0,
+    )
+    render_width: int = param(
+        320, 'of bdgs/rendered, and mapping.width at most', unit='px', low=20, high=4096
     )
     map_period_s: float = param(2.0, 'between two messages of bdgs/map', unit='s', low=0.0)
     keyframe_queue: int = param(
@@ -144,7 +169,9 @@ class SlamConfig(GraphConfig):
     """Parameters of slam_node itself; it hands everything else to the nodes it starts."""
 
     bag: str = param('', 'recording to replay through the graph; empty: wait for a camera')
-    output: str = param('', 'folder for trajectory.txt, map.ply and metrics.json')
+    output: str = param(
+        '', 'folder for trajectory.txt, trajectory_final.txt, map.ply and metrics.json'
+    )
     exit_at_end: bool = param(False, 'write the results and stop when the recording is over')
     processes: str = param(
         'several',

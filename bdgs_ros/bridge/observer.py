@@ -57,6 +57,7 @@ class GraphObserver:
         config: BdgsConfig,
         name: str,
         ground_truth: Trajectory | None,
+        map_file: Path,
         extra: dict[str, Any],
     ) -> dict[str, Any]:
         """Write `metrics.json` beside the trajectory and map that the nodes have saved."""
@@ -64,13 +65,14 @@ class GraphObserver:
 
         result = self._result(read_trajectory(folder / 'trajectory.txt'))
         found = self._node_metrics()
-        if (folder / 'map.ply').is_file():
-            found += map_metrics(folder / 'map.ply')
+        if map_file.is_file():
+            found += map_metrics(map_file)
         return write_results(
             folder,
             result,
             name=name,
             ground_truth=ground_truth,
+            final=read_trajectory(folder / 'trajectory_final.txt'),
             config=config,
             frames_expected=self._count('replay', 'frames_sent') or len(result.rows),
             more=found,

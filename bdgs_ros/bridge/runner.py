@@ -6,7 +6,6 @@ import ctypes
 import os
 import signal
 import sys
-import threading
 from collections.abc import Callable
 
 import rclpy
@@ -80,7 +79,7 @@ def run(
         give_way(node.nice)
         executor = make_executor()
         executor.add_node(node)
-        while not (node.finished or stop.is_set()):
+        while not (node.finished or stop):
             executor.spin_once(timeout_sec=_SPIN_S)
         return node.exit_code
     except BdgsError as error:
@@ -92,6 +91,7 @@ def run(
         rclpy.try_shutdown()
 
 
+<<<<<<< HEAD
 def make_executor() -> Executor:
     """
     Return the executor of a node whose callbacks never wait.
@@ -108,16 +108,20 @@ def make_executor() -> Executor:
 
 
 def _catch_signals() -> threading.Event:
+=======
+def _catch_signals() -> list[int]:
+>>>>>>> h3
     """
-    Return an event that SIGINT and SIGTERM set, instead of rclpy's own handlers.
+    Return a list that SIGINT and SIGTERM are added to, instead of rclpy's own handlers.
 
     Those shut the context down under the feet of callbacks and threads that still publish. A
-    second signal, when launch and the terminal both send one, changes nothing.
+    second signal, when launch and the terminal both send one, changes nothing: nor may it wait
+    for a lock that the handler of the first one holds, as that of an Event would.
     """
-    stop = threading.Event()
+    received: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    return stop
+        signal.signal(number, lambda number, _: received.append(number))
+    return received
 
 
 def follow_parent() -> None:

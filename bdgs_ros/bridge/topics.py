@@ -30,6 +30,11 @@ MAP = 'bdgs/map'
 RESET_EVENT = 'bdgs/reset_event'
 """Tracking tells the other nodes that it forgot everything."""
 
+MAP_REQUEST = 'bdgs/map_request'
+"""Tracking asks to be shown the map that it is to begin in."""
+LOCALIZATION = 'bdgs/localization'
+"""Whether the map is frozen."""
+
 TF = '/tf'
 CLOCK = '/clock'
 DIAGNOSTICS = '/diagnostics'
@@ -40,6 +45,7 @@ SET_LOCALIZATION_MODE = 'bdgs/set_localization_mode'
 SAVE_MAP = 'bdgs/save_map'
 LOAD_MAP = 'bdgs/load_map'
 SAVE_TRAJECTORY = 'bdgs/save_trajectory'
+SAVE_FINAL_TRAJECTORY = 'bdgs/save_final_trajectory'
 REPLAY_PAUSE = 'bdgs/replay/pause'
 REPLAY_STEP = 'bdgs/replay/step'
 

@@ -55,6 +55,7 @@ class Worker(Generic[Item]):
         self._first: Callable[[], None] | None = None
         self._changed = threading.Condition()
         self._busy = False
+        self._woken = False
         self._stopping = False
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
@@ -71,6 +72,12 @@ class Worker(Generic[Item]):
                 self._items.popleft()
                 self.dropped += 1
             self._items.append(item)
+            self._changed.notify_all()
+
+    def wake(self) -> None:
+        """Have `idle` called soon, when nothing else is to do."""
+        with self._changed:
+            self._woken = True
             self._changed.notify_all()
 
     def restart(self, action: Callable[[], None]) -> None:
@@ -113,8 +120,9 @@ class Worker(Generic[Item]):
 
     def _next(self) -> Callable[[], None] | None:
         with self._changed:
-            if not self._items and self._first is None and not self._stopping:
+            if not (self._items or self._first or self._woken or self._stopping):
                 self._changed.wait(self._idle_period_s)
+            self._woken = False
             if self._stopping or not (self._items or self._first is not None):
                 return None
             self._busy = True

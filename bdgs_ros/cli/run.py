@@ -7,18 +7,15 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from bdgs_ros.cli.config import add_config_arguments, load_config, with_weights
-from bdgs_ros.core import se3
 from bdgs_ros.core.errors import ConfigError
 from bdgs_ros.core.types import Pose
+from bdgs_ros.data.trajectory_io import POSE_COLUMNS, parse_pose
 from bdgs_ros.eval.metric import dump_json, markdown_table
 
 NAME = 'run'
 HELP = 'run a recording (folder or bag) without ROS; write trajectory, map, metrics, pictures'
 
-_POSE_NUMBERS = 7
 _SHOWN = (
     'frames_in', 'frames_lost', 'coverage', 'keyframes', 'ate_rmse', 'ate_final_rmse', 'ate_mean',
     'ate_std', 'ate_max', 'rpe_translation_second_rmse', 'dynamic_precision', 'dynamic_recall',
@@ -58,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         '--start-pose',
-        metavar='"TX TY TZ QX QY QZ QW"',
+        metavar='"X Y Z QX QY QZ QW"',
         help="with --map: about where the camera starts, in metres (default: the map's origin)",
     )
     parser.add_argument('--json', action='store_true', help='print the metrics for machines')
@@ -95,18 +92,10 @@ def _start_pose(arguments: argparse.Namespace) -> Pose | None:
         raise ConfigError('--localise and --start-pose need a map: add --map FILE')
     if arguments.start_pose is None:
         return None
-    words = arguments.start_pose.replace(',', ' ').split()
     try:
-        values = np.array([float(word) for word in words])
-    except ValueError:
-        values = np.zeros(0)
-    norm = np.linalg.norm(values[3:])
-    if len(values) != _POSE_NUMBERS or not np.isfinite(values).all() or not 0.5 < norm < 2.0:
-        raise ConfigError(
-            "--start-pose expects 'tx ty tz qx qy qz qw' (metres, unit quaternion), "
-            f"received '{arguments.start_pose}'"
-        )
-    return se3.from_position_quat_xyzw(values[:3], values[3:])
+        return parse_pose(arguments.start_pose)
+    except ValueError as error:
+        raise ConfigError(f"--start-pose expects '{POSE_COLUMNS}', found {error}") from error
 
 
 def _summary(metrics: dict[str, Any]) -> str:

@@ -20,6 +20,8 @@ DepthImage = NDArray[np.float32]  # [H, W] metres along z, 0 = invalid
 ProbabilityImage = NDArray[np.uint8]  # [H, W] P(dynamic) x 255
 Pose = NDArray[np.float64]  # [4, 4]
 
+NO_KEYFRAME_NS = 0
+"""Stamp of a `ModelView` that answers no keyframe: the view of a map that tracking begins in."""
 DYNAMIC_THRESHOLD = 128  # a ProbabilityImage pixel at or above this is called dynamic
 
 

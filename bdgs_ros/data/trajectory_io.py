@@ -10,10 +10,10 @@ import numpy as np
 from bdgs_ros.core import se3
 from bdgs_ros.core.errors import DatasetError
 from bdgs_ros.core.files import write_text
-from bdgs_ros.core.types import StampedPose, Trajectory
+from bdgs_ros.core.types import Pose, StampedPose, Trajectory
 
 NS_PER_S = 1_000_000_000
-_COLUMNS = 8
+POSE_COLUMNS = 'x y z qx qy qz qw'
 
 
 def parse_stamp_ns(text: str) -> int:
@@ -67,21 +67,37 @@ def read_trajectory(path: Path) -> Trajectory:
 
 
 def _parse_pose(path: Path, number: int, line: str) -> StampedPose:
-    words = line.replace(',', ' ').split()
+    stamp, _, pose = line.replace(',', ' ').strip().partition(' ')
     try:
-        if len(words) != _COLUMNS:
-            raise ValueError(f'{len(words)} columns')
-        values = np.array([float(word) for word in words[1:]])
-        if not np.isfinite(values).all():
-            raise ValueError('a number that is not finite')
-        if not 0.5 < np.linalg.norm(values[3:]) < 2.0:
-            raise ValueError(f'a quaternion of norm {np.linalg.norm(values[3:]):.3g}')
-        stamp_ns = parse_stamp_ns(words[0])
+        return StampedPose(parse_stamp_ns(stamp), parse_pose(pose))
     except ValueError as error:
         raise DatasetError(
-            f"'{path}', line {number}: expected 'stamp x y z qx qy qz qw', found {error}"
+            f"'{path}', line {number}: expected 'stamp {POSE_COLUMNS}', found {error}"
         ) from error
-    return StampedPose(stamp_ns, se3.from_position_quat_xyzw(values[:3], values[3:]))
+
+
+def parse_pose(text: str) -> Pose:
+    """
+    Read one pose, metres and a quaternion that need not be of length one.
+
+    Returns
+    -------
+    T_world_camera : ndarray, shape (4, 4)
+
+    Raises
+    ------
+    ValueError
+        If the text is not seven finite numbers with a rotation: the message says what it is.
+
+    """
+    values = np.array([float(word) for word in text.replace(',', ' ').split()])
+    if len(values) != len(POSE_COLUMNS.split()):
+        raise ValueError(f"{len(values)} numbers for the pose '{POSE_COLUMNS}'")
+    if not np.isfinite(values).all():
+        raise ValueError('a number that is not finite')
+    if not 0.5 < np.linalg.norm(values[3:]) < 2.0:
+        raise ValueError(f'a quaternion of norm {np.linalg.norm(values[3:]):.3g}')
+    return se3.from_position_quat_xyzw(values[:3], values[3:])
 
 
 def write_trajectory(path: Path, trajectory: Trajectory) -> None:
@@ -94,7 +110,7 @@ def write_trajectory(path: Path, trajectory: Trajectory) -> None:
         If the path cannot be written.
 
     """
-    lines = ['# stamp x y z qx qy qz qw', *(_format_pose(pose) for pose in trajectory.poses)]
+    lines = [f'# stamp {POSE_COLUMNS}', *(_format_pose(pose) for pose in trajectory.poses)]
     write_text_atomically(path, '\n'.join(lines) + '\n')
 
 

@@ -1,7 +1,8 @@
-"""The trajectory plot: path from above, and error over time."""
+"""Plots of trajectories: path from above, and error over time."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ _ESTIMATE = '#2a78d6'
 _TRUTH = '#52514e'
 _INK = '#0b0b0b'
 _GRID = '#e4e3df'
+_LINES = (_ESTIMATE, '#c2410c', '#52514e', '#7c3aed')
 _AXES = 'xyz'
 
 
@@ -62,6 +64,37 @@ def plot_trajectory(
         _draw_path(columns[0], est.positions, None)
     if title:
         figure.suptitle(title, color=_INK, fontsize=11)
+    write_aside(path, lambda aside: figure.savefig(aside, dpi=130))
+
+
+def plot_errors(path: Path, results: Mapping[str, AteResult], title: str = '') -> None:
+    """
+    Draw the error of every frame over time, of several trajectories of one recording.
+
+    Parameters
+    ----------
+    path : Path
+        A .png, .pdf or .svg file.
+    results : mapping of str to AteResult
+        By the name of each trajectory; four at most.
+    title : str
+        Written above the plot.
+
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 3.4), layout='constrained')
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    start_ns = min(int(result.stamps_ns[0]) for result in results.values())
+    for color, (name, result) in zip(_LINES, results.items(), strict=False):
+        seconds = (result.stamps_ns - start_ns) * 1e-9
+        label = f'{name}: RMSE {100.0 * result.statistics.rmse:.2f} cm'
+        axes.plot(seconds, 100.0 * result.errors_m, color=color, lw=1.4, label=label)
+    axes.set(xlabel='time [s]', ylabel='error [cm]', title=title, ylim=(0, None))
+    axes.legend(frameon=False, fontsize=9)
+    _tidy(axes)
     write_aside(path, lambda aside: figure.savefig(aside, dpi=130))
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,21 +14,33 @@ import cv2
 import numpy as np
 from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import Image
-from std_msgs.msg import Empty
+from std_msgs.msg import Bool, Empty
 
 from bdgs_ros.bridge import conversions, parameters, topics
 from bdgs_ros.bridge.cdr_image import CdrImage, image_from_cdr
 from bdgs_ros.bridge.frames import FrameDecoder, FrameSource, RawFrame
 from bdgs_ros.bridge.health import Health
-from bdgs_ros.bridge.map_output import MapOutput, Viewpoint
+from bdgs_ros.bridge.map_output import MapOutput
 from bdgs_ros.bridge.model_view import ModelPublisher
 from bdgs_ros.bridge.node_config import MappingNodeConfig
 from bdgs_ros.bridge.runner import GraphNode, run
 from bdgs_ros.bridge.services import SideNode
 from bdgs_ros.bridge.stamped import StampBuffer
 from bdgs_ros.bridge.worker import Worker
+from bdgs_ros.core import se3
 from bdgs_ros.core.errors import BdgsError, ConfigError
-from bdgs_ros.core.types import Keyframe, ModelView, ProbabilityImage, RgbdFrame
+from bdgs_ros.core.types import (
+    NO_KEYFRAME_NS,
+    Keyframe,
+    ModelView,
+    Pose,
+    ProbabilityImage,
+    RgbdFrame,
+    StampedPose,
+    Trajectory,
+)
+from bdgs_ros.data.trajectory_io import parse_pose, write_trajectory
+from bdgs_ros.mapping.entrance import check_entrance, entrance
 from bdgs_ros.mapping.mapper import Mapper
 
 _FRAME_WAIT_S = 2.0
@@ -34,6 +48,7 @@ _PENDING_S = 30.0
 _LABELS_WAIT_S = 0.3
 _LABELS_KEPT = 90
 _MAX_LABEL_AGE_NS = 500_000_000
+_AT_RUN_TIME = ('map_file', 'final_trajectory_file')
 
 
 class MappingNode(GraphNode):
@@ -41,12 +56,17 @@ class MappingNode(GraphNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__('mapping_node', **options)
-        config = parameters.declare(self, MappingNodeConfig(), runtime=('map_file',))
+        config = parameters.declare(self, MappingNodeConfig(), runtime=_AT_RUN_TIME)
         cv2.setNumThreads(1)
         self.nice = config.mapping_nice
         self._config = config
         self._health = Health(self, 'mapping')
+<<<<<<< HEAD
         self._mapper = Mapper(config.mapping, config.belief, self._is_hurried)
+=======
+        self._mapper = Mapper(config.mapping, config.belief)
+        self._start_pose = _parse_start_pose(config.start_pose)
+>>>>>>> h3
         self._lock = threading.Lock()  # of the mapper: worker and services
         self._version = 0
         self._saved = (0, time.monotonic())
@@ -54,20 +74,20 @@ class MappingNode(GraphNode):
         self._labels: StampBuffer[CdrImage] = StampBuffer(_LABELS_KEPT)
         self._decoder = FrameDecoder.of(self)
         self._models = ModelPublisher(self, self._config.map_frame)
-        self._output = MapOutput(self, config)
-        self._viewpoint: Viewpoint | None = None
-        self._pose: PoseStamped | None = None
-        self._frame: tuple[RgbdFrame, str] | None = None
-        self._worker: Worker[tuple[PoseStamped, RawFrame | None]] = Worker(
-            self._on_keyframe,
+        self._output = MapOutput(self, config, self._health)
+        self._poses: list[StampedPose] = []
+        self._newest: RawFrame | None = None
+        self._is_asked = False
+        self._worker: Worker[Callable[[], None]] = Worker(
+            lambda task: task(),
             self._health.error,
             None if config.lockstep else config.keyframe_queue,
             self._on_idle,
             nice=config.mapping_nice,
         )
-        self._load_at_start()
         self._subscribe()
         self._serve()
+        self._load_at_start()
         self.get_logger().info(f'mapping is ready: mode {config.mode}')
 
     def _subscribe(self) -> None:
@@ -82,31 +102,79 @@ class MappingNode(GraphNode):
         self.create_subscription(
             Empty, topics.RESET_EVENT, lambda _: self._forget(), topics.RELIABLE
         )
+        self.create_subscription(
+            Empty, topics.MAP_REQUEST, lambda _: self._on_request(), topics.RELIABLE
+        )
+        self._localization = self.create_publisher(Bool, topics.LOCALIZATION, topics.LATCHED)
 
     def _serve(self) -> None:
         # A service waits for the keyframe at hand; meanwhile images must still be taken.
+<<<<<<< HEAD
         self._side = SideNode(self)
         self._side.serve_trigger(topics.SAVE_MAP, self._on_save)
         self._side.serve_trigger(topics.LOAD_MAP, self._on_load)
         self._side.serve_switch(topics.SET_LOCALIZATION_MODE, self._on_localization)
         self._side.start()
+=======
+        group = MutuallyExclusiveCallbackGroup()
+        serve_trigger(self, topics.SAVE_MAP, self._on_save, group)
+        serve_trigger(self, topics.LOAD_MAP, self._on_load, group)
+        serve_trigger(self, topics.SAVE_FINAL_TRAJECTORY, self._on_save_trajectory, group)
+        serve_switch(self, topics.SET_LOCALIZATION_MODE, self._on_localization, group)
+>>>>>>> h3
 
     def _keep_frame(self, raw: RawFrame) -> None:
         self._frames.put(raw.stamp_ns, raw)
+        self._newest = raw
+        self._answer_request()
 
     def _keep_labels(self, message: bytes) -> None:
         image = image_from_cdr(message)
         self._labels.put(conversions.stamp_ns(image), image)
 
     def _keep_pose(self, message: PoseStamped) -> None:
-        self._pose = message
+        pose = conversions.pose_from_message(message.pose)
+        self._poses.append(StampedPose(conversions.stamp_ns(message), pose))
+        self._output.note_pose(message, frozen=self._mapper.frozen)
+        if self._mapper.frozen:
+            self._worker.wake()
+
+    def _on_request(self) -> None:
+        self._is_asked = True
+        self._answer_request()
+
+    def _answer_request(self) -> None:
+        """Show tracking the map that it begins in, as soon as the camera is known."""
+        if self._is_asked and self._newest is not None:
+            self._is_asked = False
+            self._worker.put(partial(self._show_entrance, self._newest))
+
+    def _show_entrance(self, raw: RawFrame) -> None:
+        view = None
+        try:
+            camera = self._decoder.camera(raw)
+            self._output.see_through(camera, raw.color.header.frame_id)
+            with self._lock:
+                if len(self._mapper.map):
+                    width = self._config.mapping.width
+                    view = entrance(self._mapper, self._where_it_starts(), camera, width)
+            if view is not None:
+                check_entrance(view, self._map_file())
+        except BdgsError as error:
+            self._health.error(error)
+        finally:  # an empty answer says that there is no map
+            self._models.publish(NO_KEYFRAME_NS, view)
+
+    def _where_it_starts(self) -> Pose:
+        """Return where the camera was last, if tracking asks because it was restarted."""
+        return self._poses[-1].T_world_camera if self._poses else self._start_pose
 
     def _queue_keyframe(self, message: PoseStamped) -> None:
         # Its images are taken along now: they may be forgotten when its turn comes.
-        self._worker.put((message, self._frames.get(conversions.stamp_ns(message))))
+        raw = self._frames.get(conversions.stamp_ns(message))
+        self._worker.put(partial(self._on_keyframe, message, raw))
 
-    def _on_keyframe(self, item: tuple[PoseStamped, RawFrame | None]) -> None:
-        message, raw = item
+    def _on_keyframe(self, message: PoseStamped, raw: RawFrame | None) -> None:
         stamp_ns = conversions.stamp_ns(message)
         view = None
         try:
@@ -123,7 +191,7 @@ class MappingNode(GraphNode):
     def _map(self, keyframe: Keyframe) -> ModelView | None:
         with self._health.timed('mapping'), self._lock:
             view = self._mapper.process(keyframe)
-        self._version += 1
+            self._version += not self._mapper.frozen
         self._health.counts['keyframes'] += 1
         return view
 
@@ -140,12 +208,14 @@ class MappingNode(GraphNode):
             self._health.warn('a keyframe was announced whose images never came; it is left out')
             return None
         frame = self._decoder.decode(raw)
-        self._frame = (frame, raw.color.header.frame_id)
+        self._output.see_through(frame.camera, raw.color.header.frame_id)
         labels = self._labels_of(frame)
         return Keyframe(frame, conversions.pose_from_message(message.pose), labels)
 
     def _labels_of(self, frame: RgbdFrame) -> ProbabilityImage:
         """Return the labels of a frame; in real time the nearest older ones will do."""
+        if self._mapper.frozen:  # they would change nothing
+            return np.zeros(frame.camera.shape, np.uint8)
         present = self.count_publishers(topics.LABELS) > 0
         limit_s = self._config.lockstep_timeout_s if self._config.lockstep else _LABELS_WAIT_S
         message = self._labels.wait(frame.stamp_ns, limit_s if present else 0.0)
@@ -159,35 +229,27 @@ class MappingNode(GraphNode):
     def _on_idle(self) -> None:
         """Between keyframes: show the map, and save it if that is due."""
         with self._lock:
-            self._output.render(self._mapper, self._latest_viewpoint())
+            more_to_render = self._output.render(self._mapper)
             self._output.publish_map(self._mapper, self._version, self._config.belief.margin)
         period_s = self._config.autosave_s
         version, saved_s = self._saved
         if period_s and self._version != version and time.monotonic() - saved_s >= period_s:
             self._save()
-
-    def _latest_viewpoint(self) -> Viewpoint | None:
-        if self._pose is None or self._frame is None:
-            return None
-        frame, frame_id = self._frame
-        width = min(self._config.mapping.width, frame.camera.width)
-        return Viewpoint(
-            conversions.stamp_ns(self._pose),
-            conversions.pose_from_message(self._pose.pose),
-            frame.camera.scaled(width / frame.camera.width),
-            frame_id,
-        )
+        if more_to_render:
+            self._worker.wake()
 
     def _forget(self) -> None:
         self._frames.clear()
+        self._poses = []
+        self._newest = None
         self._worker.restart(self._start_over)
 
     def _start_over(self) -> None:
         with self._lock:
             if not self._mapper.frozen:  # a map to localise in outlives the camera's jumps
                 self._mapper.reset()
-        self._pose = None
-        self._version += 1
+                self._version += 1
+        self._output.forget()
 
     def _map_file(self) -> Path:
         file = str(self.get_parameter('map_file').value)
@@ -217,19 +279,43 @@ class MappingNode(GraphNode):
         self._version += 1
         return f"{count} Gaussians from '{file}'"
 
+    def _on_save_trajectory(self) -> str:
+        file = str(self.get_parameter('final_trajectory_file').value)
+        if not file:
+            raise ConfigError(
+                "where to? set the parameter 'final_trajectory_file' of mapping_node"
+            )
+        self._worker.wait_idle(_PENDING_S)
+        with self._lock:
+            final = self._mapper.final_trajectory(Trajectory(tuple(self._poses)))
+        write_trajectory(Path(file), final)
+        return f"{len(final)} poses in '{file}'"
+
     def _load_at_start(self) -> None:
-        if self._config.load_at_start and self._map_file().is_file():
+        # Without the map there is nothing to localise in; mapping can begin without.
+        if self._config.localization or (
+            self._config.load_at_start and self._map_file().is_file()
+        ):
             self.get_logger().info(self._on_load())
+        self._on_localization(self._config.localization)
 
     def _on_localization(self, enabled: bool) -> str:
         with self._lock:
             self._mapper.frozen = enabled
+        self._localization.publish(Bool(data=enabled))
         return 'the map is frozen' if enabled else 'the map grows'
 
     def close(self) -> None:
         """Stop working."""
         self._side.stop()
         self._worker.stop()
+
+
+def _parse_start_pose(text: str) -> Pose:
+    try:
+        return parse_pose(text) if text else se3.identity()
+    except ValueError as error:
+        raise ConfigError(f"'start_pose': {error}") from error
 
 
 def main(args: list[str] | None = None) -> int:

@@ -40,12 +40,12 @@ class SlamNode(GraphNode):
         self._config = parameters.declare(self, SlamConfig())
         self._values = {name: p.value for name, p in self._parameter_overrides.items()}
         self._slam_config = check_everything(self._config, self._values)
+        self._files = self._result_files()
         self._started_s = time.time()
         self._concluding = False
         self._observer = GraphObserver(self)
         self._savers = {
-            name: self.create_client(Trigger, name)
-            for name in (topics.SAVE_TRAJECTORY, topics.SAVE_MAP)
+            name: self.create_client(Trigger, name) for name in self._results_to_save()
         }
         arguments = forwarded_arguments(sys.argv)
         self._children = Children(arguments)
@@ -57,7 +57,7 @@ class SlamNode(GraphNode):
         )
 
     def _start_graph(self) -> None:
-        values = {**self._values, **self._result_files()}
+        values = {**self._values, **self._files}
         for name, kind in _GRAPH.items():
             if self._config.processes == 'several':
                 self._children.start(name, values)
@@ -72,12 +72,19 @@ class SlamNode(GraphNode):
     def _result_files(self) -> dict[str, str]:
         if not self._config.output:
             return {}
+        given = str(self._values.get('map_file', ''))
         folder = Path(self._config.output).resolve()
         folder.mkdir(parents=True, exist_ok=True)
         return {
             'trajectory_file': str(folder / 'trajectory.txt'),
-            'map_file': str(folder / 'map.ply'),
+            'final_trajectory_file': str(folder / 'trajectory_final.txt'),
+            # a map to begin in is the one to go on with
+            'map_file': given if self._config.begins_in_map else str(folder / 'map.ply'),
         }
+
+    def _results_to_save(self) -> list[str]:
+        saved = [topics.SAVE_TRAJECTORY, topics.SAVE_FINAL_TRAJECTORY]
+        return saved if self._config.localization else [*saved, topics.SAVE_MAP]
 
     def _watch(self) -> None:
         for child, status in self._children.ended():
@@ -109,6 +116,8 @@ class SlamNode(GraphNode):
         )
         values = dict(child.values)
         if child.name == 'mapping_node' and self._has_saved_map(values):
+            values['load_at_start'] = True
+        if child.name == 'tracking_node':  # mapping shows it the map from where it was last
             values['load_at_start'] = True
         self._children.start(child.name, values)
 
@@ -153,6 +162,7 @@ class SlamNode(GraphNode):
                 self._slam_config,
                 recording.name,
                 recording.ground_truth,
+                Path(self._files['map_file']),
                 {
                     'wall_s': time.time() - self._started_s,
                     'mode': self._config.mode,
@@ -189,6 +199,10 @@ def check_everything(config: SlamConfig, values: dict[str, Any]) -> BdgsConfig:
     for kind in NODE_CONFIGS.values():
         names = {spec.name for spec in specs(kind())}
         with_values(kind(), {n: v for n, v in values.items() if n in names})
+    if config.begins_in_map and not values.get('map_file'):
+        raise ConfigError(
+            "'load_at_start' and 'localization' need 'map_file': the map to begin in"
+        )
     if config.exit_at_end and not (config.bag and config.output):
         raise ConfigError("'exit_at_end' needs 'bag' (what to replay) and 'output' (a folder)")
     stage_names = {spec.name for spec in specs(BdgsConfig())}

@@ -36,6 +36,7 @@ class TrackingNode(GraphNode):
         cv2.setNumThreads(1)
         self._config = config
         self._paused = False
+        self._has_begun = False
         self._health = Health(self, 'tracking')
         self._tracker = CameraTracker(config.tracking)
         self._output = PoseOutput(self, config)
@@ -63,7 +64,23 @@ class TrackingNode(GraphNode):
             self._finish(raw, FrameStatus(raw.stamp_ns, FrameState.PAUSED))
             return
         self._health.mark('frame', '')
+        if not self._has_begun and not self._begin(frame):
+            self._finish(raw, FrameStatus(raw.stamp_ns, FrameState.LOST))
+            return
         self._track(raw, frame)
+
+    def _begin(self, frame: RgbdFrame) -> bool:
+        """Begin at the origin of a new world, or in a map once mapping has shown it."""
+        if self._feedback.begins_in_map:
+            answered, view = self._feedback.entrance(frame.camera)
+            waiting = '' if answered else 'LOST: mapping has not shown the map to begin in'
+            self._health.set_problem('lost', waiting)
+            if not answered:
+                return False
+            if view is not None:
+                self._tracker.start_from(view)
+        self._has_begun = True
+        return True
 
     def _track(self, raw: RawFrame, frame: RgbdFrame) -> None:
         labels = self._feedback.labels(frame)
@@ -111,6 +128,7 @@ class TrackingNode(GraphNode):
 
     def _start_over(self) -> None:
         self._tracker.reset()
+        self._has_begun = False
         self._feedback.clear()
         self._output.clear()
         self.get_logger().info('reset: the next frame is the origin')

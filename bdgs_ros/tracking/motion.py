@@ -46,7 +46,7 @@ class MotionPredictor:
     Parameters
     ----------
     config : MotionConfig
-        Accelerations expected; with `enabled` false the prediction is the last pose.
+        Which model, and the accelerations that it expects.
 
     """
 
@@ -122,6 +122,9 @@ class MotionPredictor:
             self._state = self._start(stamp_ns, measured, noise)
             return
         predicted = self._propagate(self._state, stamp_ns)
+        if self._config.model == 'velocity':
+            self._state = self._difference(self._state, stamp_ns, measured, noise)
+            return
         innovation = se3.log(se3.inverse(predicted.T_world_camera) @ measured)
         if self._is_outside(innovation, predicted.covariance[:6, :6] + noise):
             self._state = self._start(stamp_ns, measured, noise)
@@ -151,7 +154,7 @@ class MotionPredictor:
                 'call reset() after a jump back in time'
             )
         dt = (stamp_ns - state.stamp_ns) * 1e-9
-        if not self._config.enabled:
+        if self._config.model == 'none':
             noise = self._start_covariance() * dt**2
             return _State(stamp_ns, state.T_world_camera, np.zeros(6), state.covariance + noise)
         step = se3.exp(state.velocity * dt)
@@ -169,10 +172,27 @@ class MotionPredictor:
         push = np.vstack([0.5 * dt**2 * np.eye(6), dt * np.eye(6)])
         return np.asarray(push @ np.diag([linear**2] * 3 + [angular**2] * 3) @ push.T)
 
+    def _difference(self, last: _State, stamp_ns: int, measured: Pose, noise: Matrix) -> _State:
+        """
+        Take pose and velocity from the last two measurements alone, without a filter.
+
+        The covariance is that of a two-point difference, with the same noise in both poses [1]_.
+
+        References
+        ----------
+        .. [1] Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking
+           and Navigation", 2001, section 5.5.3.
+
+        """
+        dt = (stamp_ns - last.stamp_ns) * 1e-9
+        velocity = se3.log(se3.inverse(last.T_world_camera) @ measured) / dt
+        covariance = np.block([[noise, noise / dt], [noise / dt, 2 * noise / dt**2]])
+        return _State(stamp_ns, measured, velocity, covariance)
+
     def _is_outside(self, innovation: Matrix, covariance: Matrix) -> bool:
         squared = float(innovation @ np.linalg.solve(covariance, innovation))
         outside = squared > self._config.gate_sigma**2
-        if outside and self._config.enabled:
+        if outside and self._config.model == 'kalman':
             _log.info(
                 'pose is %.1f sigma off its prediction (%.3f m, %.1f deg); velocity starts anew',
                 np.sqrt(squared),
@@ -189,7 +209,7 @@ class MotionPredictor:
         kalman.H = np.hstack([np.eye(6), np.zeros((6, 6))])
         kalman.update(innovation, R=noise)
         pose = se3.orthonormalise(predicted.T_world_camera @ se3.exp(kalman.x[:6]))
-        velocity = kalman.x[6:] if self._config.enabled else np.zeros(6)
+        velocity = kalman.x[6:] if self._config.model == 'kalman' else np.zeros(6)
         covariance = 0.5 * (kalman.P + kalman.P.T)
         return _State(predicted.stamp_ns, pose, velocity, covariance)
 

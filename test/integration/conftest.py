@@ -40,7 +40,19 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope='session')
-def offline(bag: Path) -> Trajectory:
+def offline(offline_run: tuple[Trajectory, Trajectory]) -> Trajectory:
+    """Return the trajectory that `BdgsSlam` finds in the same recording."""
+    return offline_run[0]
+
+
+@pytest.fixture(scope='session')
+def offline_final(offline_run: tuple[Trajectory, Trajectory]) -> Trajectory:
+    """Return the same trajectory with what mapping found out later."""
+    return offline_run[1]
+
+
+@pytest.fixture(scope='session')
+def offline_run(bag: Path) -> tuple[Trajectory, Trajectory]:
     """Run the same recording through `BdgsSlam`."""
     from bdgs_ros.core.types import StampedPose, TrackingStatus
     from bdgs_ros.data.bag_recording import BagSequence
@@ -49,13 +61,14 @@ def offline(bag: Path) -> Trajectory:
     slam = BdgsSlam(with_values(BdgsConfig(), SETTINGS))
     results = [slam.process(frame).tracking for frame in BagSequence(bag)]
     assert len(results) == FRAMES
-    return Trajectory(
+    online = Trajectory(
         tuple(
             StampedPose(r.stamp_ns, r.T_world_camera)
             for r in results
             if r.status is TrackingStatus.OK
         )
     )
+    return online, slam.mapper.final_trajectory(online)
 
 
 @pytest.fixture

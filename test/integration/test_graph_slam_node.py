@@ -8,6 +8,7 @@ import signal
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip('rclpy', reason='needs rclpy')
@@ -51,6 +52,7 @@ def test_a_recording_to_its_end(
     graph: Graph,
     bag: Path,
     offline: Trajectory,
+    offline_final: Trajectory,
     settings: dict[str, object],
     tmp_path: Path,
     mode: str,
@@ -67,8 +69,13 @@ def test_a_recording_to_its_end(
     assert metrics['gaussians']['value'] > 100
     assert metrics['frames_sent']['value'] == len(offline)
     assert metrics['ate_rmse']['value'] < 10.0
+    live, final = (read_trajectory(out / f'trajectory{end}.txt') for end in ('', '_final'))
+    assert final.stamps_ns.tolist() == live.stamps_ns.tolist()
+    assert metrics['ate_final_rmse']['value'] < 10.0
     if mode == 'lockstep':
-        check_same(read_trajectory(out / 'trajectory.txt'), offline)
+        check_same(live, offline)
+        check_same(final, offline_final)
+        assert np.abs(final.positions - live.positions).max() > 1e-4
         assert metrics['frames_missed']['value'] == 0
     else:
         assert metrics['frames_dropped']['value'] == 0

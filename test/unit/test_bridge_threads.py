@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import signal
 import sys
 import threading
 import time
@@ -176,3 +177,30 @@ def test_a_pace_goes_on_after_a_gap() -> None:
     assert not pace.is_due(5_020_000_000)
     pace.reset()
     assert pace.is_due(0)
+
+
+def test_signals_are_counted_without_a_lock() -> None:
+    pytest.importorskip('rclpy', reason='needs rclpy')
+    from bdgs_ros.bridge import runner
+
+    before = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        received = runner._catch_signals()
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGTERM):
+            signal.raise_signal(number)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    assert received == [signal.SIGTERM, signal.SIGINT, signal.SIGTERM]
+
+
+def test_a_worker_that_is_woken_calls_idle_at_once() -> None:
+    idle = threading.Event()
+    worker: Worker[int] = Worker(
+        lambda item: None, lambda error: None, None, idle.set, idle_period_s=30.0
+    )
+    time.sleep(0.05)
+    assert not idle.is_set()
+    worker.wake()
+    assert idle.wait(2.0)
+    worker.stop()

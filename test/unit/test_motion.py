@@ -46,17 +46,36 @@ def test_noisy_poses_predict_about_as_well_as_they_are_measured() -> None:
 
 
 def test_prediction_beats_the_last_pose() -> None:
-    on, off = MotionPredictor(MotionConfig()), MotionPredictor(MotionConfig(enabled=False))
+    on, off = MotionPredictor(MotionConfig()), MotionPredictor(MotionConfig(model='none'))
     for predictor in (on, off):
         follow(predictor, 20, sigma=0.001)
     assert np.linalg.norm(error_of(on, 20)) < 0.5 * np.linalg.norm(error_of(off, 20))
 
 
 def test_switched_off_it_returns_the_last_pose() -> None:
-    predictor = MotionPredictor(MotionConfig(enabled=False))
+    predictor = MotionPredictor(MotionConfig(model='none'))
     follow(predictor, 10)
     predicted, _ = predictor.predict(10 * PERIOD_NS)
     assert np.allclose(predicted, pose_at(9), atol=1e-3)
+
+
+def test_plain_velocity_repeats_the_last_motion() -> None:
+    predictor = MotionPredictor(MotionConfig(model='velocity'))
+    follow(predictor, 2)
+    assert (
+        np.abs(error_of(predictor, 2)).max() < 1e-9
+    )  # two poses are enough, where a filter learns
+    kalman = MotionPredictor(MotionConfig())
+    follow(kalman, 2)
+    assert np.abs(error_of(kalman, 2)).max() > 1e-6
+
+
+def test_plain_velocity_carries_the_noise_of_two_poses() -> None:
+    predictor = MotionPredictor(MotionConfig(model='velocity'))
+    follow(predictor, 30)
+    _, covariance = predictor.predict(30 * PERIOD_NS)
+    # x + (x - y) has 4 + 1 times the noise of one pose; acceleration adds to it
+    assert np.diag(covariance)[0] > 5 * NOISE[0, 0]
 
 
 def test_covariance_grows_with_time_and_prediction_changes_nothing() -> None:

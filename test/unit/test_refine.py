@@ -202,7 +202,7 @@ def test_options_of_a_map_need_a_map(tmp_path, capsys, extra):
 def test_a_start_pose_is_seven_numbers(tmp_path, capsys, text):
     command = ['run', str(tmp_path), '--output', str(tmp_path), '--map', 'x.ply']
     assert main.main([*command, '--start-pose', text]) == 2
-    assert "expects 'tx ty tz qx qy qz qw'" in capsys.readouterr().err
+    assert "expects 'x y z qx qy qz qw'" in capsys.readouterr().err
 
 
 def test_a_loaded_map_is_the_start_of_a_run(finished):

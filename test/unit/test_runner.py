@@ -30,6 +30,24 @@ def test_every_frame_has_a_row_and_lost_ones_no_pose(run):
     assert stamps == {sequence[i].stamp_ns for i in range(12) if i not in (5, 6)}
 
 
+def test_a_final_trajectory_from_elsewhere_is_saved_and_scored(run, tmp_path):
+    sequence, _, result, _ = run
+    off = np.eye(4)
+    off[:3, 3] = 0.0, 0.0, 0.1
+    poses = result.trajectory.poses
+    final = Trajectory(
+        tuple(
+            StampedPose(p.stamp_ns, p.T_world_camera @ off if i % 2 else p.T_world_camera)
+            for i, p in enumerate(poses)
+        )
+    )
+    metrics = write_results(
+        tmp_path, result, ground_truth=sequence.ground_truth, final=final, with_pictures=False
+    )['metrics']
+    assert len(read_trajectory(tmp_path / 'trajectory_final.txt')) == len(poses)
+    assert metrics['ate_final_rmse']['value'] > metrics['ate_rmse']['value'] + 1.0  # cm
+
+
 def test_mapping_is_timed_on_keyframes_alone(run):
     result = run[2]
     assert [('mapping' in r.times_ms) for r in result.rows] == [r.is_keyframe for r in result.rows]
@@ -80,7 +98,9 @@ def test_results_are_complete(run, tmp_path):
     assert values['keyframes'] == 3
     assert metrics['notes'] == []
     assert json.loads((tmp_path / 'out/metrics.json').read_text())['sequence'] == 'fake'
-    assert len(read_trajectory(tmp_path / 'out/trajectory.txt')) == 10
+    for name in ('trajectory.txt', 'trajectory_final.txt'):
+        stamps = read_trajectory(tmp_path / 'out' / name).stamps_ns.tolist()
+        assert stamps == [sequence[i].stamp_ns for i in range(12) if i not in (5, 6)]
     made = {p.name for p in (tmp_path / 'out').iterdir()}
     assert made == {
         'trajectory.txt',

@@ -9,9 +9,14 @@ from bdgs_ros.core.config.param import param
 
 @dataclass(frozen=True)
 class MotionConfig:
-    """Constant-velocity Kalman prediction on SE(3)."""
+    """Prediction of the camera's motion on SE(3)."""
 
-    enabled: bool = param(True, 'predict with the filter; otherwise start from the last pose')
+    model: str = param(
+        'kalman',
+        'none: the last pose; velocity: the motion between the last two poses goes on; '
+        'kalman: constant-velocity filter',
+        choices=('none', 'velocity', 'kalman'),
+    )
     acceleration_sigma: float = param(
         3.0, 'white-noise acceleration', unit='m/s^2', low=0.0, high=100.0
     )
