@@ -54,7 +54,7 @@ class BdgsSlam:
         self.detection = DetectionStage(config.detection, detector)
         self.tracker = CameraTracker(config.tracking)
         self.mapper = Mapper(config.mapping, config.belief)
-        self.back_end = BackEnd(config.back_end, config.tracking.features)
+        self.back_end = BackEnd(config.back_end)
         self._map_width = config.mapping.width
 
     def start_from(

@@ -22,7 +22,6 @@ from bdgs_ros.back_end.loop import LoopDetector
 from bdgs_ros.back_end.pair import PairFactor, condense
 from bdgs_ros.core import se3
 from bdgs_ros.core.config.back_end import BackEndConfig
-from bdgs_ros.core.config.tracking import FeatureConfig
 from bdgs_ros.core.types import Keyframe, Pose
 
 Array = NDArray[np.float64]
@@ -52,14 +51,11 @@ class BackEnd:
     ----------
     config : BackEndConfig
         Sizes and noise.
-    features : FeatureConfig
-        Of loop closure.
 
     """
 
-    def __init__(self, config: BackEndConfig, features: FeatureConfig) -> None:
+    def __init__(self, config: BackEndConfig) -> None:
         self._config = config
-        self._features = features
         self.reset()
 
     def reset(self) -> None:
@@ -72,11 +68,12 @@ class BackEnd:
         self._poses: dict[int, Pose] = {}
         self._pairs: dict[tuple[int, int], _Pair] = {}
         self._follows: dict[int, int] = {}  # keyframes that were dropped: whom they move with
-        self._loop = LoopDetector(self._config.loop, self._features)
+        self._loop = LoopDetector(self._config.loop)
 
     def observe(self, stamp_ns: int, T_world_camera: Pose) -> None:
-        """Take the pose of every tracked frame, keyframe or not: they tell velocities."""
-        self._recent.append((stamp_ns, T_world_camera))
+        """Take the pose of every tracked frame, in order of time: they tell velocities."""
+        if not self._recent or stamp_ns > self._recent[-1][0]:
+            self._recent.append((stamp_ns, T_world_camera))
 
     def process(self, keyframe: Keyframe, poses: Mapping[int, Pose]) -> dict[int, Pose]:
         """
@@ -100,6 +97,7 @@ class BackEnd:
             return {}
         stamp_ns = keyframe.frame.stamp_ns
         self._poses = {known: poses.get(known, pose) for known, pose in self._poses.items()}
+        self.observe(stamp_ns, keyframe.T_world_camera)
         twist = self._twist(stamp_ns, keyframe.T_world_camera)
         view = View.of(keyframe, twist)
         corners = find_corners(view, self._config.bundle)
@@ -115,7 +113,7 @@ class BackEnd:
 
     def _twist(self, stamp_ns: int, T_world_camera: Pose) -> Array:
         """Return the velocity since the frame before, in the camera's frame, [6]."""
-        earlier = [entry for entry in list(self._recent) if entry[0] < stamp_ns]
+        earlier = [entry for entry in self._recent if entry[0] < stamp_ns]
         if not earlier:
             return np.zeros(6)
         before_ns, T_before = earlier[-1]

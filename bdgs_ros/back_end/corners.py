@@ -9,6 +9,7 @@ neighbouring keyframes need.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -55,7 +56,7 @@ class View:
         grey = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
         size = (round(frame.camera.width * _SMALL), round(frame.camera.height * _SMALL))
 
-        def small(image: NDArray[np.generic]) -> NDArray[np.generic]:
+        def small(image: NDArray[Any]) -> NDArray[Any]:
             return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST))
 
         return cls(
@@ -123,12 +124,13 @@ def find_corners(view: View, config: BundleConfig) -> Corners:
     """Return the best corners on surfaces that do not move."""
     size = (view.camera.width, view.camera.height)
     still = (view.p_dynamic < 255 * config.max_dynamic).astype(np.uint8)
-    still = cv2.erode(still, np.ones((round(_MARGIN_PX * _SMALL) | 1,) * 2, np.uint8))
     depth = np.nan_to_num(view.depth_m.astype(np.float32))
     kernel = np.ones((3, 3), np.uint8)
     near, far = cv2.erode(depth, kernel), cv2.dilate(depth, kernel)
     flat = (near > _LEAST_M) & (far - near < _EDGE * far)
-    mask = cv2.resize((flat & (still > 0)).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    margin = np.ones((round(_MARGIN_PX * _SMALL) | 1,) * 2, np.uint8)
+    usable = flat & (cv2.erode(still, margin) > 0)
+    mask = cv2.resize(usable.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
     found = cv2.goodFeaturesToTrack(view.grey, config.corners, _QUALITY, _APART_PX, mask=mask)
     pixels = np.zeros((0, 2)) if found is None else found.reshape(-1, 2).astype(np.float64)
     inverse, p_static = view.at(pixels)

@@ -24,9 +24,10 @@ from bdgs_ros.core.types import Pose
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-_ROUNDS = 6
+_ROUNDS = 20
 _SETTLED = 1e-5
 _TOLERANCE = 9.0  # medians of the pairs' errors beyond which a pair counts less
+_NARROWER = 4.0  # what is tolerated, from round to round
 _FIXED = 1e8
 
 
@@ -63,7 +64,9 @@ def solve(
         T_world_camera in order of time; where to start, and by `odometry_m` and `odometry_rad`
         where neighbours are to each other.
     edges : sequence of Edge
-        Pairs. One that the others contradict counts less (Geman and McClure's weights).
+        Pairs. One that the others contradict counts less (Geman and McClure's weights). At
+        first all are tolerated, then less and less (graduated non-convexity, Yang et al., RA-L
+        2020), so that a true loop far from the present poses can pull them.
     calibration : Calibration
         Start.
     config : BundleConfig
@@ -77,11 +80,13 @@ def solve(
     sigma = np.repeat([config.odometry_m, config.odometry_rad], 3)
     chain_information = np.broadcast_to(np.diag(sigma**-2), (len(chain.one), 6, 6))
     known = np.append(np.full(BENDS, config.bend_sigma), config.readout_sigma_s) ** -2
+    wide = np.inf
     for _ in range(_ROUNDS):
         system = _System(len(world))
         xi = _apart(world, pairs)
-        weight = _robust(pairs, xi, vector)
-        system.add(world, pairs, xi, vector, weight)
+        error = _errors(pairs, xi, vector)
+        wide = max(min(wide / _NARROWER, float(error.max(initial=1.0))), 1.0)
+        system.add(world, pairs, xi, vector, 1 / (1 + error / wide) ** 2)
         drift = _apart(world, chain)
         system.add_motion(world, chain, chain_information, drift)
         system.add_known(known, vector)
@@ -89,7 +94,7 @@ def solve(
         moves = step[: 6 * len(world)].reshape(-1, 6)
         world = np.array([se3.exp(move) @ T for move, T in zip(moves, world, strict=True)])
         vector = vector + step[6 * len(world) :]
-        if np.abs(step).max() < _SETTLED:
+        if wide == 1.0 and np.abs(step).max() < _SETTLED:
             break
     return Solution(
         [se3.orthonormalise(T) for T in world], Calibration.of_vector(np.asarray(vector))
@@ -144,17 +149,17 @@ def _apart(world: Array, pairs: _Pairs) -> Array:
     return np.concatenate([rho - 0.5 * np.cross(phi, rho) + second, phi], axis=1)
 
 
-def _robust(pairs: _Pairs, xi: Array, vector: Array) -> Array:
-    """Return the weight of each pair, [M]: how far is its motion from where it wants it."""
+def _errors(pairs: _Pairs, xi: Array, vector: Array) -> Array:
+    """Return how far each pair is from what it wants, over what is usual among pairs, [M]."""
     if not len(xi):
-        return np.ones(0)
+        return np.zeros(0)
     pose = pairs.information[:, :6, :6] + 1e-3 * np.eye(6)
     away = vector - pairs.calibration
     pull = pairs.gradient[:, :6] + np.einsum('mij,mj->mi', pairs.information[:, :6, 6:], away)
     error = xi + np.linalg.solve(pose, pull[:, :, None])[:, :, 0]
     chi2 = np.einsum('mi,mij,mj->m', error, pose, error)
     scale = _TOLERANCE * max(float(np.median(chi2)), 6.0)
-    return np.asarray(1 / (1 + chi2 / scale) ** 2)
+    return np.asarray(chi2 / scale)
 
 
 class _System:

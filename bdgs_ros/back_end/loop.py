@@ -9,16 +9,18 @@ corners that are then followed (`bundle`), and by the rest of the graph.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.config.back_end import LoopConfig
-from bdgs_ros.core.config.tracking import FeatureConfig
 from bdgs_ros.core.types import Keyframe, Pose
 from bdgs_ros.tracking.features import FeatureExtractor, Features, match
 from bdgs_ros.tracking.pnp import locate
+
+_LEAST_SPREAD = 0.03  # of their distance, in the second direction
 
 
 @dataclass(frozen=True)
@@ -37,16 +39,13 @@ class LoopDetector:
     Parameters
     ----------
     config : LoopConfig
-        How many comparisons, and what counts as recognised.
-    features : FeatureConfig
-        Of ORB; the count is that of `config`.
+        Features, how many comparisons, and what counts as recognised.
 
     """
 
-    def __init__(self, config: LoopConfig, features: FeatureConfig) -> None:
+    def __init__(self, config: LoopConfig) -> None:
         self._config = config
-        self._matching = replace(features, count=config.features)
-        self._extractor = FeatureExtractor(self._matching)
+        self._extractor = FeatureExtractor(config.features)
         self._known: dict[int, tuple[Features, PinholeCamera]] = {}
         self._turn = 0
 
@@ -86,7 +85,7 @@ class LoopDetector:
     def _compare(self, new: int, earlier: int) -> Recognised | None:
         features, _ = self._known[new]
         others, camera = self._known[earlier]
-        pairs = match(features, others, self._matching)
+        pairs = match(features, others, self._config.features)
         if len(pairs) < self._config.min_inliers:
             return None
         points, pixels = features.points_camera[pairs[:, 0]], others.pixels[pairs[:, 1]]
@@ -100,10 +99,7 @@ class LoopDetector:
         return Recognised(earlier, located.T_current_reference, len(located.inliers))
 
 
-def _is_spread(points: np.ndarray) -> bool:
+def _is_spread(points: NDArray[np.float32]) -> bool:
     """Return whether points determine a pose: not all on a line or on one small thing."""
     scatter = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return bool(scatter[1] / np.sqrt(len(points)) > _LEAST_SPREAD * np.median(points[:, 2]))
-
-
-_LEAST_SPREAD = 0.03  # of the distance, in the second direction

@@ -87,7 +87,7 @@ def condense(
         Noise.
 
     """
-    T = T_other_one
+    T = np.asarray(T_other_one, np.float64)
     bent = bend_functions(shared.tangents) @ calibration.bend
     inverse = shared.inverse_depth + bent
     for i in range(_ROUNDS):
@@ -95,7 +95,7 @@ def condense(
         weight = shared.p_static[:, None] * _weights(linear.residuals, config.dof)
         information, gradient, back = _eliminate(linear, weight)
         pose = information[:6, :6] + 1e-6 * np.diag(np.diag(information)[:6]) + 1e-3 * np.eye(6)
-        step = -np.linalg.solve(pose, gradient[:6])
+        step = np.asarray(-np.linalg.solve(pose, gradient[:6]), np.float64)
         if i == _ROUNDS - 1 or np.abs(step).max() < _SETTLED:
             break
         change = back[0] + back[1][:, :6] @ step

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from collections import deque
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from rclpy.executors import MultiThreadedExecutor
 from sensor_msgs.msg import Image
 from std_msgs.msg import Empty
 
+from bdgs_ros.back_end.back_end import BackEnd
 from bdgs_ros.bridge import conversions, parameters, topics
 from bdgs_ros.bridge.frames import FrameDecoder, FrameSource, RawFrame
 from bdgs_ros.bridge.health import Health
@@ -29,12 +31,14 @@ from bdgs_ros.bridge.worker import Worker
 from bdgs_ros.core.errors import BdgsError, ConfigError
 from bdgs_ros.core.types import Keyframe, ModelView, ProbabilityImage, RgbdFrame
 from bdgs_ros.mapping.mapper import Mapper
+from bdgs_ros.pipeline import take_keyframe
 
 _FRAME_WAIT_S = 2.0
 _PENDING_S = 30.0
 _LABELS_WAIT_S = 0.3
 _LABELS_KEPT = 90
 _MAX_LABEL_AGE_NS = 500_000_000
+_POSES_KEPT = 1000
 
 
 class MappingNode(GraphNode):
@@ -47,6 +51,8 @@ class MappingNode(GraphNode):
         self._config = config
         self._health = Health(self, 'mapping')
         self._mapper = Mapper(config.mapping, config.belief)
+        self._back_end = BackEnd(config.back_end)
+        self._tracked: deque[PoseStamped] = deque(maxlen=_POSES_KEPT)
         self._lock = threading.Lock()  # of the mapper: worker and services
         self._version = 0
         self._saved = (0, time.monotonic())
@@ -100,6 +106,7 @@ class MappingNode(GraphNode):
 
     def _keep_pose(self, message: PoseStamped) -> None:
         self._pose = message
+        self._tracked.append(message)
 
     def _queue_keyframe(self, message: PoseStamped) -> None:
         # Its images are taken along now: they may be forgotten when its turn comes.
@@ -122,10 +129,18 @@ class MappingNode(GraphNode):
 
     def _map(self, keyframe: Keyframe) -> ModelView | None:
         with self._health.timed('mapping'), self._lock:
-            view = self._mapper.process(keyframe)
+            self._observe_until(keyframe.frame.stamp_ns)
+            view = take_keyframe(self._back_end, self._mapper, keyframe)
         self._version += 1
         self._health.counts['keyframes'] += 1
         return view
+
+    def _observe_until(self, stamp_ns: int) -> None:
+        """Give the back end the poses of frames up to a keyframe; it knows that one itself."""
+        while self._tracked and conversions.stamp_ns(self._tracked[0]) < stamp_ns:
+            message = self._tracked.popleft()
+            pose = conversions.pose_from_message(message.pose)
+            self._back_end.observe(conversions.stamp_ns(message), pose)
 
     def _wait_frame(self, stamp_ns: int) -> RawFrame | None:
         timeout_s = self._config.lockstep_timeout_s if self._config.lockstep else _FRAME_WAIT_S
@@ -183,6 +198,8 @@ class MappingNode(GraphNode):
         with self._lock:
             if not self._mapper.frozen:  # a map to localise in outlives the camera's jumps
                 self._mapper.reset()
+            self._back_end.reset()
+            self._tracked.clear()
         self._pose = None
         self._version += 1
 
@@ -210,6 +227,7 @@ class MappingNode(GraphNode):
         with self._lock:
             self._mapper.load(file)
             self._mapper.history.begin_run()
+            self._back_end.reset()
             count = len(self._mapper.map)
         self._version += 1
         return f"{count} Gaussians from '{file}'"

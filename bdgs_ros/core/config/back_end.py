@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from bdgs_ros.core.config.param import param
+from bdgs_ros.core.config.tracking import FeatureConfig
 
 
 @dataclass(frozen=True)
@@ -44,11 +45,11 @@ class LoopConfig:
     """Places seen before, recognised without knowing where the camera is."""
 
     enabled: bool = param(True, 'look for places seen before')
-    features: int = param(400, 'ORB features of a keyframe', low=50, high=10000)
     candidates: int = param(12, 'earlier keyframes compared with a new one', low=1, high=1000)
     min_inliers: int = param(25, 'matches that agree on one pose', low=6, high=1000)
     min_share: float = param(0.4, 'of all matches', low=0.0, high=1.0)
     tolerance_px: float = param(4.0, 'of a match that agrees', unit='px', low=0.1, high=50.0)
+    features: FeatureConfig = field(default_factory=lambda: FeatureConfig(count=400))
 
 
 @dataclass(frozen=True)
