@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 
 _RECENT = 300  # poses of frames: keyframes may come late
 _LONGEST_STEP_S = 0.2  # between two frames that tell a velocity
-_RENEWED = 12  # pairs condensed again at a keyframe, at most
+_RENEWED = 6  # pairs condensed again at a keyframe, at most
 _READOUT_OFF_S = 0.002  # from the calibration that a pair was condensed with
 _NEAR_M, _NEAR_RAD = 2.0, 0.8  # keyframes further apart are not asked what they share
 _FEW_INLIERS = 0.5  # of the followed corners, for a recognised place to be believed

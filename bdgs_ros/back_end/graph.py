@@ -24,10 +24,10 @@ from bdgs_ros.core.types import Pose
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-_ROUNDS = 20
-_SETTLED = 1e-5
+_ROUNDS = 10
+_SETTLED = 1e-4  # m and rad
 _TOLERANCE = 9.0  # medians of the pairs' errors beyond which a pair counts less
-_NARROWER = 4.0  # what is tolerated, from round to round
+_NARROWER = 10.0  # what is tolerated, from round to round
 _FIXED = 1e8
 
 

@@ -16,7 +16,7 @@ class BundleConfig:
     window: int = param(8, 'newest keyframes that a new one is joined with', low=1, high=100)
     older: int = param(4, 'older keyframes that show the same, joined too', low=0, high=100)
     overlap: float = param(0.4, 'least share of its corners in an older one', low=0.0, high=1.0)
-    corners: int = param(80, 'followed from each keyframe', low=20, high=1000)
+    corners: int = param(60, 'followed from each keyframe', low=20, high=1000)
     max_dynamic: float = param(0.5, 'likelier to move: no corner', low=0.0, high=1.0)
     least_shared: int = param(15, 'fewer corners join no pair', low=6, high=1000)
     pixel_sigma: float = param(0.7, 'of a followed corner', unit='px', low=0.01, high=10.0)
@@ -45,7 +45,7 @@ class LoopConfig:
     """Places seen before, recognised without knowing where the camera is."""
 
     enabled: bool = param(True, 'look for places seen before')
-    candidates: int = param(12, 'earlier keyframes compared with a new one', low=1, high=1000)
+    candidates: int = param(8, 'earlier keyframes compared with a new one', low=1, high=1000)
     min_inliers: int = param(25, 'matches that agree on one pose', low=6, high=1000)
     min_share: float = param(0.4, 'of all matches', low=0.0, high=1.0)
     tolerance_px: float = param(4.0, 'of a match that agrees', unit='px', low=0.1, high=50.0)
