@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+from bdgs_ros.back_end.back_end import BackEnd
 from bdgs_ros.core import se3
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.config import BdgsConfig
-from bdgs_ros.core.types import Keyframe, Labels, Pose, RgbdFrame, TrackingResult
+from bdgs_ros.core.types import (
+    Keyframe,
+    Labels,
+    ModelView,
+    Pose,
+    RgbdFrame,
+    TrackingResult,
+    TrackingStatus,
+)
 from bdgs_ros.detection.detector import Detector, LateDetector
 from bdgs_ros.detection.stage import DetectionStage
 from bdgs_ros.mapping.entrance import check_entrance, entrance
@@ -43,6 +52,7 @@ class BdgsSlam:
         self.detection = DetectionStage(config.detection, detector)
         self.tracker = CameraTracker(config.tracking)
         self.mapper = Mapper(config.mapping, config.belief)
+        self.back_end = BackEnd(config.back_end)
         self._map_width = config.mapping.width
 
     def start_from(
@@ -86,13 +96,37 @@ class BdgsSlam:
         """Take the next frame: who moves, where is the camera, what does the world look like."""
         labels = self.detection.process(frame)
         tracking = self.tracker.process(frame, labels)
+        if tracking.status is TrackingStatus.OK:
+            self.back_end.observe(frame.stamp_ns, tracking.T_world_camera)
         if tracking.is_keyframe:
             keyframe = Keyframe(frame, tracking.T_world_camera, labels.p_dynamic)
-            self.tracker.set_model(self.mapper.process(keyframe))
+            self.tracker.set_model(take_keyframe(self.back_end, self.mapper, keyframe))
         return FrameResult(labels, tracking)
 
     def reset(self) -> None:
         """Forget everything."""
+        self.back_end.reset()
         self.detection.reset()
         self.tracker.reset()
         self.mapper.reset()
+
+
+def take_keyframe(back_end: BackEnd, mapper: Mapper, keyframe: Keyframe) -> ModelView | None:
+    """
+    Make a keyframe agree with the earlier ones, then take it into the map.
+
+    Returns
+    -------
+    view : ModelView or None
+        See `Mapper.process`. Its pose has the corrections, and tracking follows it.
+
+    """
+    if mapper.frozen:
+        return mapper.process(keyframe)
+    tracked = keyframe.T_world_camera
+    transforms = back_end.process(keyframe, mapper.keyframe_poses())
+    if not transforms:
+        return mapper.process(keyframe)
+    mapper.correct_poses(transforms)
+    corrected = transforms[keyframe.frame.stamp_ns] @ tracked
+    return mapper.process(replace(keyframe, T_world_camera=corrected), tracked)

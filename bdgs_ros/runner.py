@@ -40,6 +40,7 @@ class Slam(Protocol):
 
     detection: Any
     tracker: Any
+    back_end: Any
     mapper: Any
 
     def process(self, frame: RgbdFrame) -> Outcome:
@@ -112,15 +113,15 @@ def run_sequence(
     Returns
     -------
     result : RunResult
-        One row per frame, times in milliseconds: `detection`, `tracking`, `mapping` (keyframes
-        alone) and `frame`, all of them together.
+        One row per frame, times in milliseconds: `detection`, `tracking`, `back_end` and
+        `mapping` (keyframes alone) and `frame`, all of them together.
 
     """
     recorder = Recorder() if recorder is None else recorder
     times_ms: dict[str, float] = {}
-    stages = slam.detection, slam.tracker, slam.mapper
-    names = 'detection', 'tracking', 'mapping'
-    slam.detection, slam.tracker, slam.mapper = (
+    stages = slam.detection, slam.tracker, slam.back_end, slam.mapper
+    names = 'detection', 'tracking', 'back_end', 'mapping'
+    slam.detection, slam.tracker, slam.back_end, slam.mapper = (
         _Timed(stage, name, times_ms) for stage, name in zip(stages, names, strict=True)
     )
     try:
@@ -133,7 +134,7 @@ def run_sequence(
             for observe in observers:
                 observe(frame, outcome.tracking)
     finally:
-        slam.detection, slam.tracker, slam.mapper = stages
+        slam.detection, slam.tracker, slam.back_end, slam.mapper = stages
     return recorder.result()
 
 

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from bdgs_ros.bench.map_quality import LiveScores
-from bdgs_ros.core.types import RgbdFrame, TrackingResult
+from bdgs_ros.core.types import RgbdFrame, TrackingResult, Trajectory
 from bdgs_ros.eval import memory
 from bdgs_ros.eval.recorder import FrameRow
+from bdgs_ros.eval.trajectory import associate, ate
 
 
 class CpuTimed:
@@ -22,11 +23,11 @@ class CpuTimed:
         self._mapper = mapper
         self.cpu_ms: list[float] = []
 
-    def process(self, keyframe: Any) -> Any:
+    def process(self, *arguments: Any) -> Any:
         """Pass the keyframe on."""
         start = time.process_time()
         try:
-            return self._mapper.process(keyframe)
+            return self._mapper.process(*arguments)
         finally:
             self.cpu_ms.append(1e3 * (time.process_time() - start))
 
@@ -94,6 +95,10 @@ def columns(rows: Sequence[FrameRow], watch: BlockWatch, quality: LiveScores) ->
         'block_tracking_ms': [
             round(_median([r.times_ms['tracking'] for r in b]), 1) for b in blocks
         ],
+        'block_back_end_ms': [
+            round(_median([r.times_ms['back_end'] for r in b if 'back_end' in r.times_ms]), 1)
+            for b in blocks
+        ],
         'block_keyframes': [len(s) for s in sizes],
         'block_gaussians': [round(_median(s)) if s else None for s in sizes],
         'block_live_psnr_db': _means(scored, 'psnr', watch.block, count),
@@ -103,6 +108,23 @@ def columns(rows: Sequence[FrameRow], watch: BlockWatch, quality: LiveScores) ->
         'growth': _growth(times),
         'cpu_growth': _growth(cpu),
     }
+
+
+def drift_cm(truth: Trajectory, final: Trajectory, block: int) -> list[float]:
+    """
+    Return the RMS position error of each block of poses when only the first block is aligned.
+
+    Where a recording comes back to its start, drift shows as blocks that get worse.
+    """
+    T_truth_world = ate(truth, Trajectory(final.poses[:block])).T_gt_est
+    drift = []
+    for start in range(0, len(final), block):
+        part = Trajectory(final.poses[start : start + block])
+        true_rows, rows = associate(truth, part)
+        positions = part.positions[rows] @ T_truth_world[:3, :3].T + T_truth_world[:3, 3]
+        away = np.linalg.norm(positions - truth.positions[true_rows], axis=1)
+        drift.append(round(100 * float(np.sqrt(np.mean(away**2))), 2))
+    return drift
 
 
 def _means(

@@ -53,6 +53,7 @@ _COLUMNS = {
     'ate_final_cm': 'ate_final_rmse',
     'gaussians': 'gaussians',
     'map_mb': 'map_size',
+    'back_end_ms': 'back_end_median',
     'mapping_ms': 'mapping_median',
     'mapping_p95_ms': 'mapping_p95',
     'tracking_ms': 'tracking_median',
@@ -258,10 +259,14 @@ def _run_long(cell: Cell, options: Options) -> dict[str, Any]:
         with_pictures=False,
     )
     row = _chosen(metrics['metrics'])
+    final = slam.mapper.final_trajectory(result.trajectory)
+    known = loop.ground_truth
+    drift = long_run.drift_cm(known, final, watch.block) if known is not None else None
     return {
         **row,
         'peak_rss_mb': max(watch.peaks_mb),
         **long_run.columns(result.rows, watch, quality),
+        'block_drift_cm': drift,
     }
 
 

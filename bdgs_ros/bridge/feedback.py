@@ -58,29 +58,19 @@ class Feedback:
         self._models: StampBuffer[tuple[int, ModelMessages]] = StampBuffer(_MODELS_KEPT)
         self._heard: set[str] = set()
         self._keyframes: OrderedDict[int, PinholeCamera] = OrderedDict()
-<<<<<<< HEAD
-        node.create_subscription(Image, topics.LABELS, self._keep_labels, topics.KEPT, raw=True)
-=======
         self._asked_s = -math.inf
         self._map_is_frozen = config.localization
         self._request = node.create_publisher(Empty, topics.MAP_REQUEST, topics.RELIABLE)
         node.create_subscription(Bool, topics.LOCALIZATION, self._on_localization, topics.LATCHED)
-        node.create_subscription(
-            Image,
-            topics.LABELS,
-            lambda message: self._labels.put(conversions.stamp_ns(message), message),
-            topics.KEPT,
-        )
->>>>>>> h3
+        node.create_subscription(Image, topics.LABELS, self._keep_labels, topics.KEPT, raw=True)
         self._subscription = ModelSubscription(
             node, lambda stamp_ns, found: self._models.put(stamp_ns, (stamp_ns, found))
         )
 
-<<<<<<< HEAD
     def _keep_labels(self, message: bytes) -> None:
         image = image_from_cdr(message)
         self._labels.put(conversions.stamp_ns(image), image)
-=======
+
     def _on_localization(self, message: Bool) -> None:
         self._map_is_frozen = message.data
 
@@ -107,7 +97,6 @@ class Feedback:
                 break
         self._keyframes[NO_KEYFRAME_NS] = camera
         return found is not None, None if found is None else self._decode(*found)
->>>>>>> h3
 
     def labels(self, frame: RgbdFrame) -> Labels | None:
         """Return the labels of a frame, in real time of the newest frame that has any."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from bdgs_ros.core.config import (
+    BackEndConfig,
     BeliefConfig,
     DetectionConfig,
     MappingConfig,
@@ -140,6 +141,7 @@ class MappingNodeConfig(GraphConfig):
     mapping_nice: int = param(10, 'how much mapping gives way to tracking', low=0, high=19)
     mapping: MappingConfig = field(default_factory=MappingConfig)
     belief: BeliefConfig = field(default_factory=BeliefConfig)
+    back_end: BackEndConfig = field(default_factory=BackEndConfig)
 
 
 @dataclass(frozen=True)

@@ -91,7 +91,6 @@ def run(
         rclpy.try_shutdown()
 
 
-<<<<<<< HEAD
 def make_executor() -> Executor:
     """
     Return the executor of a node whose callbacks never wait.
@@ -107,10 +106,7 @@ def make_executor() -> Executor:
     return EventsExecutor()
 
 
-def _catch_signals() -> threading.Event:
-=======
 def _catch_signals() -> list[int]:
->>>>>>> h3
     """
     Return a list that SIGINT and SIGTERM are added to, instead of rclpy's own handlers.
 

@@ -17,11 +17,7 @@ from bdgs_ros.eval.metric import dump_json
 NAME = 'bench'
 HELP = 'measure accuracy or speed; finished cells are kept, so an interrupted bench goes on'
 
-<<<<<<< HEAD
-_BENCHES = ('slam', 'belief', 'mapping', 'tracking', 'rasterizer')
-=======
-_BENCHES = ('slam', 'accuracy', 'belief', 'mapping', 'rasterizer')
->>>>>>> h3
+_BENCHES = ('slam', 'accuracy', 'belief', 'mapping', 'tracking', 'rasterizer')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -8,7 +8,7 @@ move with it; between two keyframes the corrections of both are blended.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -52,10 +52,23 @@ class History:
         """Keep of earlier runs nothing but the stamps: their poses correct no new frame."""
         self._earlier_ns, self._anchors = self.stamps_ns, {}
 
-    def add(self, keyframe: MapKeyframe) -> None:
-        """Take a keyframe as tracking gave it."""
+    @property
+    def poses(self) -> dict[int, Pose]:
+        """`T_world_camera` of this run's keyframes by stamp (ns), as they are now."""
+        return {stamp_ns: anchor.final for stamp_ns, anchor in self._anchors.items()}
+
+    def add(self, keyframe: MapKeyframe, tracked: Pose | None = None) -> None:
+        """Take a keyframe, and where tracking saw it if it has been moved since."""
         pose = keyframe.T_world_camera
-        self._anchors[keyframe.stamp_ns] = Anchor(pose, pose, pose, keyframe.exposure.copy())
+        online = pose if tracked is None else tracked
+        self._anchors[keyframe.stamp_ns] = Anchor(online, pose, pose, keyframe.exposure.copy())
+
+    def move(self, transforms: Mapping[int, Pose]) -> None:
+        """Move keyframes by `T_new_old` in world, by stamp (ns)."""
+        for stamp_ns, T_new_old in transforms.items():
+            anchor = self._anchors.get(stamp_ns)
+            if anchor is not None:
+                anchor.final = se3.orthonormalise(T_new_old @ anchor.final)
 
     def publish(self, keyframe: MapKeyframe) -> None:
         """Note that tracking now gets the view of a keyframe from where it is."""

@@ -93,9 +93,10 @@ class Mapper:
         self._photos: list[Photo] = []
         self._ranges: list[RangeImage] = []
         self._count = 0
+        self._index_of: dict[int, int] = {}  # of this run's keyframes, by stamp
         self._rng = np.random.default_rng(self._config.seed)
 
-    def process(self, keyframe: Keyframe) -> ModelView | None:
+    def process(self, keyframe: Keyframe, tracked: Pose | None = None) -> ModelView | None:
         """
         Take a keyframe into the map.
 
@@ -103,6 +104,8 @@ class Mapper:
         ----------
         keyframe : Keyframe
             Frame, pose and dynamic prior.
+        tracked : ndarray, shape (4, 4), optional
+            Pose that tracking gave it, where the back end has corrected it since.
 
         Returns
         -------
@@ -121,7 +124,7 @@ class Mapper:
         static = self._look(small, agree)
         in_front = self._in_front(small, static)
         level = self._growth_level(small, in_front)
-        current = self._remember(fine, level.static)
+        current = self._remember(fine, level.static, tracked)
         self._calibrate(current, level, static)
         self._insert(current, level, static, in_front & ~is_dynamic(small.p_dynamic))
         companions = self._companions()
@@ -225,7 +228,7 @@ class Mapper:
     def _levels(self, frame: RgbdFrame, moving: Mask, count: int) -> tuple[Level, ...]:
         return build_levels(frame.color, frame.depth_m, moving, frame.camera, count, self.vignette)
 
-    def _remember(self, keyframe: Keyframe, static: Mask) -> MapKeyframe:
+    def _remember(self, keyframe: Keyframe, static: Mask, tracked: Pose | None) -> MapKeyframe:
         """Keep the keyframe's images; `static` may be of a smaller size."""
         frame = keyframe.frame
         size = (frame.camera.width, frame.camera.height)
@@ -239,7 +242,8 @@ class Mapper:
         if self.keyframes:
             current.exposure = self.keyframes[-1].exposure.copy()
         self.keyframes.append(current)
-        self.history.add(current)
+        self.history.add(current, tracked)
+        self._index_of[current.stamp_ns] = current.index
         if len(self.keyframes) > max(self._config.keyframes, self._config.window):
             redundant = most_redundant(self.keyframes[: -self._config.window])
             self.history.refresh([redundant])
@@ -300,16 +304,23 @@ class Mapper:
         Parameters
         ----------
         transforms : mapping of int to ndarray, shape (4, 4)
-            `T_new_old` in world by `MapKeyframe.index`, also of keyframes whose images are
-            forgotten; what is not named stays.
+            `T_new_old` in world by stamp (ns), also of keyframes whose images are forgotten;
+            what is not named, or unknown, stays.
 
         """
-        self.map.deform(transforms)
-        for keyframe in self.keyframes:
-            T_new_old = transforms.get(keyframe.index)
-            if T_new_old is not None:
-                keyframe.T_world_camera = T_new_old @ keyframe.T_world_camera
+        known = {s: T for s, T in transforms.items() if s in self._index_of}
+        self.map.deform({self._index_of[s]: T for s, T in known.items()})
         self.history.refresh(self.keyframes)
+        self.history.move(known)
+        for keyframe in self.keyframes:
+            if keyframe.stamp_ns in known:
+                T_new_old = known[keyframe.stamp_ns]
+                keyframe.T_world_camera = se3.orthonormalise(T_new_old @ keyframe.T_world_camera)
+
+    def keyframe_poses(self) -> dict[int, Pose]:
+        """Return `T_world_camera` of this run's keyframes by stamp (ns), as they are now."""
+        self.history.refresh(self.keyframes)
+        return self.history.poses
 
     def _companions(self) -> list[MapKeyframe]:
         """Return the window and as many older keyframes at random, in random order."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -16,6 +17,7 @@ from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import Image
 from std_msgs.msg import Bool, Empty
 
+from bdgs_ros.back_end.back_end import BackEnd
 from bdgs_ros.bridge import conversions, parameters, topics
 from bdgs_ros.bridge.cdr_image import CdrImage, image_from_cdr
 from bdgs_ros.bridge.frames import FrameDecoder, FrameSource, RawFrame
@@ -42,12 +44,14 @@ from bdgs_ros.core.types import (
 from bdgs_ros.data.trajectory_io import parse_pose, write_trajectory
 from bdgs_ros.mapping.entrance import check_entrance, entrance
 from bdgs_ros.mapping.mapper import Mapper
+from bdgs_ros.pipeline import take_keyframe
 
 _FRAME_WAIT_S = 2.0
 _PENDING_S = 30.0
 _LABELS_WAIT_S = 0.3
 _LABELS_KEPT = 90
 _MAX_LABEL_AGE_NS = 500_000_000
+_POSES_KEPT = 1000
 _AT_RUN_TIME = ('map_file', 'final_trajectory_file')
 
 
@@ -61,12 +65,10 @@ class MappingNode(GraphNode):
         self.nice = config.mapping_nice
         self._config = config
         self._health = Health(self, 'mapping')
-<<<<<<< HEAD
         self._mapper = Mapper(config.mapping, config.belief, self._is_hurried)
-=======
-        self._mapper = Mapper(config.mapping, config.belief)
         self._start_pose = _parse_start_pose(config.start_pose)
->>>>>>> h3
+        self._back_end = BackEnd(config.back_end)
+        self._tracked: deque[StampedPose] = deque(maxlen=_POSES_KEPT)
         self._lock = threading.Lock()  # of the mapper: worker and services
         self._version = 0
         self._saved = (0, time.monotonic())
@@ -109,19 +111,12 @@ class MappingNode(GraphNode):
 
     def _serve(self) -> None:
         # A service waits for the keyframe at hand; meanwhile images must still be taken.
-<<<<<<< HEAD
         self._side = SideNode(self)
         self._side.serve_trigger(topics.SAVE_MAP, self._on_save)
         self._side.serve_trigger(topics.LOAD_MAP, self._on_load)
+        self._side.serve_trigger(topics.SAVE_FINAL_TRAJECTORY, self._on_save_trajectory)
         self._side.serve_switch(topics.SET_LOCALIZATION_MODE, self._on_localization)
         self._side.start()
-=======
-        group = MutuallyExclusiveCallbackGroup()
-        serve_trigger(self, topics.SAVE_MAP, self._on_save, group)
-        serve_trigger(self, topics.LOAD_MAP, self._on_load, group)
-        serve_trigger(self, topics.SAVE_FINAL_TRAJECTORY, self._on_save_trajectory, group)
-        serve_switch(self, topics.SET_LOCALIZATION_MODE, self._on_localization, group)
->>>>>>> h3
 
     def _keep_frame(self, raw: RawFrame) -> None:
         self._frames.put(raw.stamp_ns, raw)
@@ -135,6 +130,7 @@ class MappingNode(GraphNode):
     def _keep_pose(self, message: PoseStamped) -> None:
         pose = conversions.pose_from_message(message.pose)
         self._poses.append(StampedPose(conversions.stamp_ns(message), pose))
+        self._tracked.append(self._poses[-1])
         self._output.note_pose(message, frozen=self._mapper.frozen)
         if self._mapper.frozen:
             self._worker.wake()
@@ -190,10 +186,17 @@ class MappingNode(GraphNode):
 
     def _map(self, keyframe: Keyframe) -> ModelView | None:
         with self._health.timed('mapping'), self._lock:
-            view = self._mapper.process(keyframe)
+            self._observe_until(keyframe.frame.stamp_ns)
+            view = take_keyframe(self._back_end, self._mapper, keyframe)
             self._version += not self._mapper.frozen
         self._health.counts['keyframes'] += 1
         return view
+
+    def _observe_until(self, stamp_ns: int) -> None:
+        """Give the back end the poses of frames up to a keyframe; it knows that one itself."""
+        while self._tracked and self._tracked[0].stamp_ns < stamp_ns:
+            tracked = self._tracked.popleft()
+            self._back_end.observe(tracked.stamp_ns, tracked.T_world_camera)
 
     def _is_hurried(self) -> bool:
         return not self._config.lockstep and self._worker.waiting > 0
@@ -249,6 +252,8 @@ class MappingNode(GraphNode):
             if not self._mapper.frozen:  # a map to localise in outlives the camera's jumps
                 self._mapper.reset()
                 self._version += 1
+            self._back_end.reset()
+            self._tracked.clear()
         self._output.forget()
 
     def _map_file(self) -> Path:
@@ -275,6 +280,7 @@ class MappingNode(GraphNode):
         with self._lock:
             self._mapper.load(file)
             self._mapper.history.begin_run()
+            self._back_end.reset()
             count = len(self._mapper.map)
         self._version += 1
         return f"{count} Gaussians from '{file}'"

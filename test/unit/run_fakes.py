@@ -130,6 +130,7 @@ class FakeSlam:
     lost: tuple[int, ...] = ()
     detection: Any = field(default_factory=FakeStage)
     tracker: Any = field(default_factory=FakeStage)
+    back_end: Any = field(default_factory=FakeStage)
     mapper: Any = field(default_factory=FakeMapper)
     _count: int = 0
 

@@ -11,7 +11,8 @@ from run_fakes import FakeMapper, FakeSequence, FakeSlam, FakeTruth
 
 from bdgs_ros.bench import long_run, map_quality, mapping, sequences
 from bdgs_ros.bench.harness import Cell, Options, to_markdown
-from bdgs_ros.core.types import Detection, Labels, TrackingStatus
+from bdgs_ros.core import se3
+from bdgs_ros.core.types import Detection, Labels, StampedPose, TrackingStatus, Trajectory
 from bdgs_ros.data.synth import write_recording
 from bdgs_ros.eval.recorder import FrameRow, Recorder
 from bdgs_ros.runner import run_sequence
@@ -188,3 +189,18 @@ def test_tables_have_the_rows_that_have_their_columns():
     assert 'absent' not in quality
     assert '| b | w | 0 | 1 / 2.5 | - |' in long
     assert quality.count('no such recording') == long.count('no such recording') == 1
+
+
+def test_drift_is_what_the_first_block_does_not_explain():
+    true = [
+        StampedPose(i * 33_000_000, se3.exp(np.array([np.sin(i), np.cos(i), 0.1 * i, 0, 0, 0])))
+        for i in range(12)
+    ]
+    moved = se3.exp(np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]))
+    aside = se3.exp(np.array([0.03, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    drifted = [
+        StampedPose(p.stamp_ns, moved @ (aside if i >= 6 else np.eye(4)) @ p.T_world_camera)
+        for i, p in enumerate(true)
+    ]
+    found = long_run.drift_cm(Trajectory(tuple(true)), Trajectory(tuple(drifted)), 6)
+    assert found == pytest.approx([0.0, 3.0], abs=0.02)

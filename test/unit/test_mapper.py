@@ -135,7 +135,7 @@ def test_corrected_poses_take_the_map_along() -> None:
     before = [kf.T_world_camera.copy() for kf in mapper.keyframes]
     seen = mapper.render(before[1], CAMERA).color
     T_new_old = se3.exp(np.array([0.1, 0, 0, 0, 0.2, 0]))
-    mapper.correct_poses(dict.fromkeys(range(3), T_new_old))
+    mapper.correct_poses(dict.fromkeys([i * SECOND for i in range(3)], T_new_old))
     for kf, T in zip(mapper.keyframes, before, strict=True):
         np.testing.assert_allclose(kf.T_world_camera, T_new_old @ T)
     again = mapper.render(T_new_old @ before[1], CAMERA).color

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from bdgs_ros.core.config.back_end import BackEndConfig
 from bdgs_ros.core.config.belief import BeliefConfig
 from bdgs_ros.core.config.detection import DetectionConfig
 from bdgs_ros.core.config.mapping import MappingConfig
@@ -19,9 +20,11 @@ class BdgsConfig:
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     belief: BeliefConfig = field(default_factory=BeliefConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
+    back_end: BackEndConfig = field(default_factory=BackEndConfig)
 
 
 __all__ = [
+    'BackEndConfig',
     'BdgsConfig',
     'BeliefConfig',
     'DetectionConfig',

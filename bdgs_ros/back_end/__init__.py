@@ -1,0 +1,1 @@
+"""The back end: keyframes as a whole, bundle adjustment and loop closure."""

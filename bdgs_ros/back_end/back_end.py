@@ -1,0 +1,251 @@
+"""
+Bundle adjustment and loop closure over keyframes, beside mapping, never in the path of a frame.
+
+Each keyframe is joined with the newest ones, with older ones that show the same, and with a place
+recognised by its features. Each pair is condensed to a quadratic (`pair`); after each keyframe
+all poses and the camera's calibration are solved for (`graph`).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bdgs_ros.back_end.calibration import Calibration
+from bdgs_ros.back_end.corners import Corners, Shared, View, find_corners, follow, overlap
+from bdgs_ros.back_end.graph import Edge, solve
+from bdgs_ros.back_end.loop import LoopDetector
+from bdgs_ros.back_end.pair import PairFactor, condense
+from bdgs_ros.core import se3
+from bdgs_ros.core.config.back_end import BackEndConfig
+from bdgs_ros.core.types import Keyframe, Pose
+
+Array = NDArray[np.float64]
+
+_RECENT = 300  # poses of frames: keyframes may come late
+_LONGEST_STEP_S = 0.2  # between two frames that tell a velocity
+_RENEWED = 6  # pairs condensed again at a keyframe, at most
+_READOUT_OFF_S = 0.002  # from the calibration that a pair was condensed with
+_NEAR_M, _NEAR_RAD = 2.0, 0.8  # keyframes further apart are not asked what they share
+_FEW_INLIERS = 0.5  # of the followed corners, for a recognised place to be believed
+_METRES_PER_RADIAN = 2.0  # a turn moves the view as far as this at usual depths
+
+
+@dataclass
+class _Pair:
+    """Two keyframes, newer and older, and the corners of the newer one that both show."""
+
+    shared: Shared
+    factor: PairFactor
+
+
+class BackEnd:
+    """
+    Makes keyframes agree with each other.
+
+    Parameters
+    ----------
+    config : BackEndConfig
+        Sizes and noise.
+
+    """
+
+    def __init__(self, config: BackEndConfig) -> None:
+        self._config = config
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self.calibration = Calibration.perfect()
+        self.loops = 0
+        """How many recognised places were joined."""
+        self._recent: deque[tuple[int, Pose]] = deque(maxlen=_RECENT)
+        self._views: dict[int, View] = {}
+        self._poses: dict[int, Pose] = {}
+        self._pairs: dict[tuple[int, int], _Pair] = {}
+        self._follows: dict[int, int] = {}  # keyframes that were dropped: whom they move with
+        self._loop = LoopDetector(self._config.loop)
+
+    def observe(self, stamp_ns: int, T_world_camera: Pose) -> None:
+        """Take the pose of every tracked frame, in order of time: they tell velocities."""
+        if not self._recent or stamp_ns > self._recent[-1][0]:
+            self._recent.append((stamp_ns, T_world_camera))
+
+    def process(self, keyframe: Keyframe, poses: Mapping[int, Pose]) -> dict[int, Pose]:
+        """
+        Take a new keyframe, and say how it and the earlier ones should move.
+
+        Parameters
+        ----------
+        keyframe : Keyframe
+            Newer than all others; its pose as tracking gave it.
+        poses : mapping of int to ndarray, shape (4, 4)
+            Present `T_world_camera` of earlier keyframes by stamp (ns): mapping moves them too.
+
+        Returns
+        -------
+        transforms : dict of int to ndarray, shape (4, 4)
+            `T_new_old` in world by stamp, of all keyframes that ever were; empty where nothing
+            moves.
+
+        """
+        if not self._config.bundle.enabled:
+            return {}
+        stamp_ns = keyframe.frame.stamp_ns
+        self._poses = {known: poses.get(known, pose) for known, pose in self._poses.items()}
+        self.observe(stamp_ns, keyframe.T_world_camera)
+        twist = self._twist(stamp_ns, keyframe.T_world_camera)
+        view = View.of(keyframe, twist)
+        corners = find_corners(view, self._config.bundle)
+        self._poses[stamp_ns], self._views[stamp_ns] = keyframe.T_world_camera, view
+        for other in self._partners(corners):
+            self._join(corners, other, self._relative(other, stamp_ns))
+        if self._config.loop.enabled:
+            self._close_loop(keyframe, corners)
+        self._renew()
+        transforms = self._solve()
+        self._drop_redundant()
+        return transforms
+
+    def _twist(self, stamp_ns: int, T_world_camera: Pose) -> Array:
+        """Return the velocity since the frame before, in the camera's frame, [6]."""
+        earlier = [entry for entry in self._recent if entry[0] < stamp_ns]
+        if not earlier:
+            return np.zeros(6)
+        before_ns, T_before = earlier[-1]
+        step_s = (stamp_ns - before_ns) * 1e-9
+        if step_s > _LONGEST_STEP_S:
+            return np.zeros(6)
+        return np.asarray(se3.log(se3.inverse(T_before) @ T_world_camera) / step_s)
+
+    def _relative(self, other: int, one: int) -> Pose:
+        """Return T_other_one as it is now."""
+        return se3.inverse(self._poses[other]) @ self._poses[one]
+
+    def _partners(self, corners: Corners) -> list[int]:
+        """Return the window, and the older keyframes that show most of the corners."""
+        config = self._config.bundle
+        stamp_ns = corners.view.stamp_ns
+        earlier = [known for known in self._views if known != stamp_ns]
+        window, older = earlier[-config.window :], earlier[: -config.window]
+        near = [known for known in older if _are_near(self._relative(known, stamp_ns))]
+        shares = [
+            overlap(corners, self._views[known], self._relative(known, stamp_ns)) for known in near
+        ]
+        order = np.argsort(-np.array(shares), kind='stable')[: config.older]
+        return window + [near[i] for i in order if shares[i] >= config.overlap]
+
+    def _join(self, corners: Corners, other: int, T_other_one: Pose) -> bool:
+        """Add a pair, if the other keyframe shows enough of the corners."""
+        config = self._config.bundle
+        shared = follow(corners, self._views[other], T_other_one)
+        if len(shared) < config.least_shared:
+            return False
+        factor = self._condense(shared, corners.view.stamp_ns, other, T_other_one)
+        if factor.inliers < _FEW_INLIERS * len(shared):
+            return False
+        self._pairs[corners.view.stamp_ns, other] = _Pair(shared, factor)
+        return True
+
+    def _condense(self, shared: Shared, one: int, other: int, T_other_one: Pose) -> PairFactor:
+        views = self._views[one], self._views[other]
+        return condense(
+            shared,
+            T_other_one,
+            (views[0].twist, views[1].twist),
+            self.calibration,
+            views[1].camera.fx,
+            self._config.bundle,
+        )
+
+    def _close_loop(self, keyframe: Keyframe, corners: Corners) -> None:
+        """Join a place that the present poses do not bring together with the new keyframe."""
+        stamp_ns = keyframe.frame.stamp_ns
+        self._loop.add(keyframe)
+        joined = {old for new, old in self._pairs if new == stamp_ns}
+        window = list(self._views)[-self._config.bundle.window - 1 :]
+        among = [known for known in self._views if known not in joined and known not in window]
+        found = self._loop.find(stamp_ns, among) if among else None
+        if found is not None and self._join(corners, found.stamp_ns, found.T_earlier_new):
+            self.loops += 1
+
+    def _renew(self) -> None:
+        """Condense again the pairs whose calibration has become the most wrong."""
+        off = {
+            key: abs(pair.factor.calibration.readout_s - self.calibration.readout_s)
+            for key, pair in self._pairs.items()
+        }
+        worst = sorted(off, key=lambda key: -off[key])[:_RENEWED]
+        for one, other in worst:
+            if off[one, other] > _READOUT_OFF_S:
+                pair = self._pairs[one, other]
+                start = pair.factor.T_other_one
+                pair.factor = self._condense(pair.shared, one, other, start)
+
+    def _solve(self) -> dict[int, Pose]:
+        """Solve for all poses; return what moves by enough."""
+        stamps = list(self._poses)
+        place = {stamp_ns: i for i, stamp_ns in enumerate(stamps)}
+        edges = [
+            Edge(place[one], place[other], pair.factor)
+            for (one, other), pair in self._pairs.items()
+        ]
+        if not edges:
+            return {}
+        before = [self._poses[stamp_ns] for stamp_ns in stamps]
+        solution = solve(before, edges, self.calibration, self._config.bundle)
+        self.calibration = solution.calibration
+        moved = {
+            stamp_ns: new @ se3.inverse(old)
+            for stamp_ns, new, old in zip(stamps, solution.poses, before, strict=True)
+        }
+        largest = max(
+            np.linalg.norm(new[:3, 3] - old[:3, 3])
+            for new, old in zip(solution.poses, before, strict=True)
+        )
+        if largest < self._config.least_m:
+            return {}
+        self._poses = dict(zip(stamps, solution.poses, strict=True))
+        # Tracking follows the newest keyframe.
+        T_new_old = moved[stamps[-1]]
+        self._recent = deque([(s, T_new_old @ T) for s, T in self._recent], maxlen=_RECENT)
+        return moved | {gone: moved[self._leader(gone)] for gone in self._follows}
+
+    def _leader(self, stamp_ns: int) -> int:
+        while stamp_ns in self._follows:
+            stamp_ns = self._follows[stamp_ns]
+        return stamp_ns
+
+    def _drop_redundant(self) -> None:
+        """Over the budget, the keyframe nearest to another one leaves and moves with that."""
+        if len(self._views) <= self._config.keyframes:
+            return
+        stamps = list(self._views)
+        gone, stays = _most_redundant([self._poses[s] for s in stamps], self._config.bundle.window)
+        self._forget(stamps[gone], stamps[stays])
+
+    def _forget(self, gone: int, leader: int) -> None:
+        del self._views[gone], self._poses[gone]
+        self._loop.forget(gone)
+        self._follows[gone] = leader
+        self._pairs = {key: pair for key, pair in self._pairs.items() if gone not in key}
+
+
+def _are_near(T: Pose) -> bool:
+    return bool(np.linalg.norm(T[:3, 3]) < _NEAR_M and se3.rotation_angle_rad(T) < _NEAR_RAD)
+
+
+def _most_redundant(poses: Sequence[Pose], window: int) -> tuple[int, int]:
+    """Return which keyframe is nearest to another, and to which; not the first, not the window."""
+    centres = np.array([pose[:3, 3] for pose in poses])
+    axes = np.array([pose[:3, 2] for pose in poses])
+    apart = np.linalg.norm(centres[:, None] - centres, axis=2)
+    distance = apart + _METRES_PER_RADIAN * np.arccos(np.clip(axes @ axes.T, -1, 1))
+    np.fill_diagonal(distance, np.inf)
+    nearest = distance[1:-window].min(axis=1)
+    gone = 1 + int(np.argmin(nearest))
+    return gone, int(np.argmin(distance[gone]))
