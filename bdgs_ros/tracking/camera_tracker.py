@@ -9,10 +9,9 @@ at the places it knows.
 
 from __future__ import annotations
 
-import bisect
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,12 +28,23 @@ from bdgs_ros.core.types import (
     TrackingResult,
     TrackingStatus,
 )
-from bdgs_ros.tracking.align import Aligner, AlignResult, ImagePyramid
+from bdgs_ros.tracking.align import Aligner, ImagePyramid
 from bdgs_ros.tracking.keyframe_choice import KeyframeChoice
 from bdgs_ros.tracking.loss import Evidence, LossTest
 from bdgs_ros.tracking.motion import MotionPredictor
 from bdgs_ros.tracking.movers import MoverMask
 from bdgs_ros.tracking.places import Place, Places
+from bdgs_ros.tracking.starts import (
+    Attempt,
+    Estimate,
+    Hypothesis,
+    Reference,
+    Start,
+    Transform,
+    information_of,
+    latest_of,
+    moved,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -42,57 +52,6 @@ _START_SIGMA = (0.3, 0.3)  # m and rad: how well the start in a known map is kno
 _PLACE_SIGMA = (0.05, 0.03)  # of a pose from features
 _SPEED = (1.0, 2.0)  # m/s and rad/s, from one frame to the next that shall confirm it
 _MOST_TRACKED = 32  # keyframes; mapping that is further behind corrects nothing
-
-
-@dataclass(frozen=True)
-class Reference:
-    """An image with depth and known pose that frames are aligned to."""
-
-    stamp_ns: int
-    T_world_camera: Pose
-    pyramid: ImagePyramid
-
-
-@dataclass(frozen=True)
-class Start:
-    """Where to look for the camera."""
-
-    reference: Reference
-    T_world_camera: Pose
-    information: NDArray[np.float64]
-    """Shape (6, 6): how sure this is."""
-    is_far: bool = False
-    """Elsewhere than where the camera was last seen."""
-    confirms: bool = False
-    """The frame before looked right from here, too."""
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """One alignment, as a pose in world."""
-
-    T_world_camera: Pose
-    quality: AlignResult
-
-
-@dataclass(frozen=True)
-class Attempt:
-    """What came of a start."""
-
-    start: Start
-    current: ImagePyramid
-    coarse: Estimate
-    best: Estimate
-    p_dynamic: ProbabilityImage
-
-
-@dataclass(frozen=True)
-class Hypothesis:
-    """Where a lost camera may be; the next frame decides."""
-
-    stamp_ns: int
-    T_world_camera: Pose
-    start: Start
 
 
 class CameraTracker:
@@ -166,8 +125,8 @@ class CameraTracker:
         if tracked is None:
             return
         T_new_old = se3.orthonormalise(view.T_world_camera @ se3.inverse(tracked))
-        self._move(lambda stamp_ns: T_new_old if stamp_ns >= view.stamp_ns else None)
         self._tracked = {s: pose for s, pose in self._tracked.items() if s >= view.stamp_ns}
+        self._move(lambda stamp_ns: T_new_old if stamp_ns in self._tracked else None)
 
     def correct_poses(self, transforms: Mapping[int, Pose]) -> None:
         """
@@ -180,17 +139,12 @@ class CameraTracker:
             move with the last one before them that is.
 
         """
-        named = sorted(transforms)
-
-        def latest(stamp_ns: int) -> Pose | None:
-            place = bisect.bisect_right(named, stamp_ns)
-            return transforms[named[place - 1]] if place else None
-
-        self._move(latest)
+        transform = latest_of(transforms)
+        self._move(transform)
         if self._model is not None:
-            self._model = _moved(self._model, latest)
+            self._model = moved(self._model, transform)
 
-    def _move(self, transform: Callable[[int], Pose | None]) -> None:
+    def _move(self, transform: Transform) -> None:
         """Move all that is known of keyframes, and the present with the last of them."""
         self._hypothesis = None
         self._places.move(transform)
@@ -203,7 +157,7 @@ class CameraTracker:
         T_new_old = transform(self._keyframe.stamp_ns)
         if T_new_old is not None:
             self._motion.move(T_new_old)
-            self._keyframe = _moved(self._keyframe, transform)
+            self._keyframe = moved(self._keyframe, transform)
 
     def process(self, frame: RgbdFrame, labels: Labels | None = None) -> TrackingResult:
         """
@@ -272,10 +226,10 @@ class CameraTracker:
             yield Start(self._keyframe, predicted, np.asarray(np.linalg.inv(covariance)))
         elif self._model is not None:
             pose = self._model.T_world_camera
-            yield Start(self._model, pose, _information(_START_SIGMA), is_far=True)
+            yield Start(self._model, pose, information_of(_START_SIGMA), is_far=True)
         for sighting in self._places.find(frame, prior):
             reference = self._recall(sighting.place)
-            information = _information(_PLACE_SIGMA)
+            information = information_of(_PLACE_SIGMA)
             yield Start(reference, sighting.T_world_camera, information, is_far=True)
 
     def _confirming(self, hypothesis: Hypothesis, stamp_ns: int) -> Start:
@@ -284,7 +238,7 @@ class CameraTracker:
         return replace(
             hypothesis.start,
             T_world_camera=hypothesis.T_world_camera,
-            information=_information((position, angle)),
+            information=information_of((position, angle)),
             confirms=True,
         )
 
@@ -395,20 +349,6 @@ class CameraTracker:
             del self._tracked[min(self._tracked)]
         self._choice.begin(frame)
         self._places.add(frame, T_world_camera, p_dynamic)
-
-
-def _moved(reference: Reference, transform: Callable[[int], Pose | None]) -> Reference:
-    T_new_old = transform(reference.stamp_ns)
-    if T_new_old is None:
-        return reference
-    moved = se3.orthonormalise(T_new_old @ reference.T_world_camera)
-    return replace(reference, T_world_camera=moved)
-
-
-def _information(sigma: tuple[float, float]) -> NDArray[np.float64]:
-    """Return the inverse covariance of a pose known to metres and radians."""
-    position, angle = sigma
-    return np.diag([position**-2] * 3 + [angle**-2] * 3)
 
 
 def _result(

@@ -9,7 +9,7 @@ The likeliest places are matched feature by feature, and PnP with RANSAC says wh
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import cv2
@@ -22,6 +22,7 @@ from bdgs_ros.core.config.tracking import FeatureConfig, PlacesConfig
 from bdgs_ros.core.types import Pose, ProbabilityImage, RgbdFrame
 from bdgs_ros.tracking.features import FeatureExtractor, Features, match
 from bdgs_ros.tracking.pnp import locate
+from bdgs_ros.tracking.starts import Transform
 
 _TABLES, _BITS = 8, 12  # of the hash: words per feature, and bits of each
 _METRES_PER_RADIAN = 2.0  # a turn moves the view as far as this at usual depths
@@ -102,7 +103,7 @@ class Places:
         if len(self._places) > self._config.count:
             del self._places[_most_redundant(self._places)]
 
-    def move(self, transform: Callable[[int], Pose | None]) -> None:
+    def move(self, transform: Transform) -> None:
         """
         Follow a correction of the world.
 
