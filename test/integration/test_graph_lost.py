@@ -31,7 +31,9 @@ def covered_bag(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[in
         files = sorted((folder / 'synth' / kind).glob('*.png'))
         for i in COVERED:
             image = cv2.imread(str(files[i]), cv2.IMREAD_UNCHANGED)
-            cv2.imwrite(str(files[i]), np.zeros_like(image))
+            dark = np.zeros_like(image)
+            dark[:20, :20] = 5000 if kind == 'depth' else 0  # no depth at all would be skipped
+            cv2.imwrite(str(files[i]), dark)
     convert(folder / 'synth', folder / 'bag')
     truth = read_trajectory(folder / 'synth' / 'groundtruth.txt')
     return folder / 'bag', truth.stamps_ns.tolist()
@@ -52,6 +54,8 @@ def test_a_covered_lens_in_the_graph(
     found = read_trajectory(out / 'trajectory.txt')
     expected = [s for i, s in enumerate(stamps_ns) if i not in COVERED]
     assert found.stamps_ns.tolist() == expected
+    report = json.loads((out / 'metrics.json').read_text())
+    assert report['nodes']['tracking']['frames_lost'] == str(len(COVERED))
+    assert report['metrics']['frames_lost']['value'] == len(COVERED)
+    assert report['metrics']['ate_rmse']['value'] < 2.0
     assert f'{len(COVERED)} lost' in slam.text()
-    metrics = json.loads((out / 'metrics.json').read_text())['metrics']
-    assert metrics['ate_rmse']['value'] < 2.0
