@@ -73,7 +73,8 @@ class BdgsSlam:
         camera : PinholeCamera
             Of the frames to come.
         T_world_camera : ndarray, shape (4, 4), optional
-            About where the camera starts, in the world of the map; by default its origin.
+            About where the camera starts, in the world of the map; by default its origin. It may
+            be anywhere if the map was saved with its keyframes.
         localise : bool
             Leave the map as it is.
 
@@ -90,7 +91,7 @@ class BdgsSlam:
         self.mapper.frozen = localise
         view = entrance(self.mapper, start, camera.rectified(), self._map_width)
         check_entrance(view, map_file)
-        self.tracker.start_from(view)
+        self.tracker.start_from(view, self.mapper.photographs())
 
     def process(self, frame: RgbdFrame) -> FrameResult:
         """Take the next frame: who moves, where is the camera, what does the world look like."""

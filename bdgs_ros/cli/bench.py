@@ -17,7 +17,7 @@ from bdgs_ros.eval.metric import dump_json
 NAME = 'bench'
 HELP = 'measure accuracy or speed; finished cells are kept, so an interrupted bench goes on'
 
-_BENCHES = ('slam', 'accuracy', 'belief', 'mapping', 'tracking', 'rasterizer')
+_BENCHES = ('slam', 'accuracy', 'belief', 'mapping', 'tracking', 'recovery', 'rasterizer')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,14 +39,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--seeds',
         type=int,
         metavar='N',
-        help='random seeds 0 to N-1 (default: 1; 5 for accuracy and belief)',
+        help='random seeds 0 to N-1 (default: 1; 5 for accuracy, belief and recovery)',
     )
     parser.add_argument(
         '--jobs',
         type=int,
         default=1,
         metavar='N',
-        help='benches slam, accuracy, belief: cells that run at once, one thread each, no times',
+        help='slam, accuracy, belief, recovery: cells that run at once, one thread each, no times',
     )
     parser.add_argument(
         '--data',

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -383,6 +383,14 @@ class Mapper:
             np.where(known, static.depth / safe, 0).astype(np.float32),
             _to_probability_image(np.asarray(static.p_dynamic / safe, np.float32)),
         )
+
+    def photographs(self) -> Iterator[Keyframe]:
+        """Yield the keyframes of the map at its size: places that may be recognised."""
+        for known in self.keyframes:
+            level = known.levels[0]
+            frame = RgbdFrame(known.stamp_ns, level.image, level.depth_m, level.camera)
+            moving = np.where(level.static, known.p_dynamic, np.uint8(255))
+            yield Keyframe(frame, known.T_world_camera, moving)
 
     def save(self, path: Path, *, keyframes: bool = True) -> None:
         """

@@ -2,13 +2,16 @@
 Where the camera is, frame by frame, section 3.1 of the paper.
 
 Predict, align to the last keyframe, see what moves, refine against the rendered static map,
-decide whether the pose can be trusted and whether the frame becomes a keyframe.
+decide whether the pose can be trusted and whether the frame becomes a keyframe. Where it cannot
+be trusted the camera is lost: no pose is given, and it is looked for where it was last seen and
+at the places it knows.
 """
 
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +19,7 @@ from numpy.typing import NDArray
 from bdgs_ros.core import se3
 from bdgs_ros.core.config import TrackingConfig
 from bdgs_ros.core.types import (
+    Keyframe,
     Labels,
     ModelView,
     Pose,
@@ -24,31 +28,30 @@ from bdgs_ros.core.types import (
     TrackingResult,
     TrackingStatus,
 )
-from bdgs_ros.tracking.align import Aligner, AlignResult, ImagePyramid
+from bdgs_ros.tracking.align import Aligner, ImagePyramid
+from bdgs_ros.tracking.keyframe_choice import KeyframeChoice
+from bdgs_ros.tracking.loss import Evidence, LossTest
 from bdgs_ros.tracking.motion import MotionPredictor
 from bdgs_ros.tracking.movers import MoverMask
+from bdgs_ros.tracking.places import Place, Places
+from bdgs_ros.tracking.starts import (
+    Attempt,
+    Estimate,
+    Hypothesis,
+    Reference,
+    Start,
+    Transform,
+    information_of,
+    latest_of,
+    moved,
+)
 
 _log = logging.getLogger(__name__)
 
-_START_SIGMA_M = 0.3  # how well the start in a known map is known
-_START_SIGMA_RAD = 0.3
+_START_SIGMA = (0.3, 0.3)  # m and rad: how well the start in a known map is known
+_PLACE_SIGMA = (0.05, 0.03)  # of a pose from features
+_SPEED = (1.0, 2.0)  # m/s and rad/s, from one frame to the next that shall confirm it
 _MOST_TRACKED = 32  # keyframes; mapping that is further behind corrects nothing
-
-
-@dataclass(frozen=True)
-class Reference:
-    """An image with depth and known pose that frames are aligned to."""
-
-    T_world_camera: Pose
-    pyramid: ImagePyramid
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """One alignment, as a pose in world."""
-
-    T_world_camera: Pose
-    quality: AlignResult
 
 
 class CameraTracker:
@@ -67,6 +70,9 @@ class CameraTracker:
         self._motion = MotionPredictor(config.motion)
         self._movers = MoverMask(config.movers)
         self._readout_s = config.readout_s  # of the camera: outlives a reset
+        self._choice = KeyframeChoice(config.keyframe)
+        self._loss = LossTest(config.loss)
+        self._places = Places(config.places, config.features)
         self.reset()
 
     def reset(self) -> None:
@@ -74,13 +80,17 @@ class CameraTracker:
         self._keyframe: Reference | None = None
         self._model: Reference | None = None
         self._tracked: dict[int, Pose] = {}  # keyframes whose view has not come yet
-        self._keyframe_depth_m = 1.0
-        self._frames_since_keyframe = 0
-        self._world_is_known = False
+        self._is_lost = False
+        self._hypothesis: Hypothesis | None = None
+        self.evidence: Evidence | None = None
+        """Of the last frame, aligned where it was expected."""
         self._motion.reset()
         self._movers.reset()
+        self._choice.begin(None)
+        self._loss.reset()
+        self._places.clear()
 
-    def start_from(self, view: ModelView) -> None:
+    def start_from(self, view: ModelView, keyframes: Iterable[Keyframe] = ()) -> None:
         """
         Begin in a map that exists: the first frame is aligned to a view of it.
 
@@ -88,11 +98,15 @@ class CameraTracker:
         ----------
         view : ModelView
             Rendered from about where the camera is. Frames are LOST until one fits to it.
+        keyframes : iterable of Keyframe
+            Of the map; where the camera may be instead.
 
         """
         self.reset()
         self.set_model(view)
-        self._world_is_known = True
+        self._is_lost = True
+        for keyframe in keyframes:
+            self._places.add(keyframe.frame, keyframe.T_world_camera, keyframe.p_dynamic)
 
     def set_model(self, view: ModelView | None) -> None:
         """
@@ -107,21 +121,46 @@ class CameraTracker:
             self._readout_s = view.readout_s
         posterior = view.p_dynamic if self._config.refine.posterior else None
         pyramid = self._aligner.pyramid(view.color, view.depth_m, posterior, view.camera)
-        self._model = Reference(view.T_world_camera, pyramid)
+        self._model = Reference(view.stamp_ns, view.T_world_camera, pyramid)
 
     def _follow(self, view: ModelView) -> None:
         tracked = self._tracked.get(view.stamp_ns)
-        if tracked is None or self._keyframe is None:
+        if tracked is None:
             return
         T_new_old = se3.orthonormalise(view.T_world_camera @ se3.inverse(tracked))
-        self._motion.move(T_new_old)
-        moved = T_new_old @ self._keyframe.T_world_camera
-        self._keyframe = replace(self._keyframe, T_world_camera=moved)
-        self._tracked = {
-            stamp_ns: T_new_old @ pose
-            for stamp_ns, pose in self._tracked.items()
-            if stamp_ns >= view.stamp_ns
-        }
+        self._tracked = {s: pose for s, pose in self._tracked.items() if s >= view.stamp_ns}
+        self._move(lambda stamp_ns: T_new_old if stamp_ns in self._tracked else None)
+
+    def correct_poses(self, transforms: Mapping[int, Pose]) -> None:
+        """
+        Follow a correction of the trajectory, such as a closed loop.
+
+        Parameters
+        ----------
+        transforms : mapping of int to ndarray, shape (4, 4)
+            `T_new_old` in world by the stamp of a keyframe (ns). Keyframes that are not named
+            move with the last one before them that is.
+
+        """
+        transform = latest_of(transforms)
+        self._move(transform)
+        if self._model is not None:
+            self._model = moved(self._model, transform)
+
+    def _move(self, transform: Transform) -> None:
+        """Move all that is known of keyframes, and the present with the last of them."""
+        self._hypothesis = None
+        self._places.move(transform)
+        for stamp_ns, pose in self._tracked.items():
+            T_new_old = transform(stamp_ns)
+            if T_new_old is not None:
+                self._tracked[stamp_ns] = se3.orthonormalise(T_new_old @ pose)
+        if self._keyframe is None:
+            return
+        T_new_old = transform(self._keyframe.stamp_ns)
+        if T_new_old is not None:
+            self._motion.move(T_new_old)
+            self._keyframe = moved(self._keyframe, transform)
 
     def process(self, frame: RgbdFrame, labels: Labels | None = None) -> TrackingResult:
         """
@@ -144,32 +183,33 @@ class CameraTracker:
         expected = np.maximum(prior, self._movers.expected(frame.camera.shape))
         sweep = self._readout_s * self._motion.velocity
         current = self._aligner.pyramid(frame.color, frame.depth_m, expected, frame.camera, sweep)
-        if self._keyframe is None:
-            first = self._enter if self._world_is_known else self._start
-            return first(frame, current, prior)
-        predicted, covariance = self._motion.predict(frame.stamp_ns)
-        information = np.asarray(np.linalg.inv(covariance), np.float64)
-        coarse = self._align(self._keyframe, current, predicted, information)
-        p_dynamic = self._see_movers(prior, current, coarse)
-        velocity = self._motion.velocity_with(
-            frame.stamp_ns, coarse.T_world_camera, coarse.quality.covariance
-        )
-        current = self._aligner.with_dynamic(current, p_dynamic, self._readout_s * velocity)
-        fine = self._refine(current, coarse, information)
-        return self._conclude(frame, current, coarse.quality.overlap, fine, p_dynamic, predicted)
+        if self._keyframe is None and not self._is_lost:
+            return self._begin(frame, current, prior)
+        self._choice.count()
+        first: Attempt | None = None
+        for start in self._starts(frame, prior):
+            attempt = self._attempt(start, frame.stamp_ns, current, prior)
+            first = first or attempt
+            if not self._loss.objection(attempt.best.quality):
+                break
+        assert first is not None
+        self.evidence = self._loss.evidence(first.best.quality)
+        if self._loss.objection(attempt.best.quality):
+            return self._lose(frame, first)
+        return self._conclude(frame, attempt)
 
     def _prior(self, frame: RgbdFrame, labels: Labels | None) -> ProbabilityImage:
         if labels is None or not self._config.masked:
             return np.zeros(frame.camera.shape, np.uint8)
         return labels.p_dynamic
 
-    def _start(
+    def _begin(
         self, frame: RgbdFrame, current: ImagePyramid, p_dynamic: ProbabilityImage
     ) -> TrackingResult:
         """Make the first frame the origin of the world and a keyframe."""
         T_world_camera, covariance = se3.identity(), 1e-6 * np.eye(6)
         self._motion.update(frame.stamp_ns, T_world_camera, covariance)
-        self._become_keyframe(frame, T_world_camera, current)
+        self._become_keyframe(frame, T_world_camera, current, p_dynamic)
         return TrackingResult(
             frame.stamp_ns,
             TrackingStatus.OK,
@@ -181,23 +221,52 @@ class CameraTracker:
             1.0,
         )
 
-    def _enter(
-        self, frame: RgbdFrame, current: ImagePyramid, prior: ProbabilityImage
-    ) -> TrackingResult:
-        """Find the first frame in the known map, and make it a keyframe."""
-        assert self._model is not None
-        guess = self._model.T_world_camera
-        information = np.diag(1 / np.array([_START_SIGMA_M**2] * 3 + [_START_SIGMA_RAD**2] * 3))
-        coarse = self._align(self._model, current, guess, information)
+    def _starts(self, frame: RgbdFrame, prior: ProbabilityImage) -> Iterator[Start]:
+        """List where the camera may be, likeliest first; places cost time, so they are last."""
+        if self._hypothesis is not None:
+            yield self._confirming(self._hypothesis, frame.stamp_ns)
+        if self._keyframe is not None:
+            predicted, covariance = self._motion.predict(frame.stamp_ns)
+            yield Start(self._keyframe, predicted, np.asarray(np.linalg.inv(covariance)))
+        elif self._model is not None:
+            pose = self._model.T_world_camera
+            yield Start(self._model, pose, information_of(_START_SIGMA), is_far=True)
+        for sighting in self._places.find(frame, prior):
+            reference = self._recall(sighting.place)
+            information = information_of(_PLACE_SIGMA)
+            yield Start(reference, sighting.T_world_camera, information, is_far=True)
+
+    def _confirming(self, hypothesis: Hypothesis, stamp_ns: int) -> Start:
+        dt = (stamp_ns - hypothesis.stamp_ns) * 1e-9
+        position, angle = (s + v * dt for s, v in zip(_PLACE_SIGMA, _SPEED, strict=True))
+        return replace(
+            hypothesis.start,
+            T_world_camera=hypothesis.T_world_camera,
+            information=information_of((position, angle)),
+            confirms=True,
+        )
+
+    def _recall(self, place: Place) -> Reference:
+        """Make a remembered keyframe a reference again."""
+        pyramid = self._aligner.pyramid(
+            place.grey, place.depth_m.astype(np.float32), place.p_dynamic, place.camera
+        )
+        return Reference(place.stamp_ns, place.T_world_camera, pyramid)
+
+    def _attempt(
+        self, start: Start, stamp_ns: int, current: ImagePyramid, prior: ProbabilityImage
+    ) -> Attempt:
+        """Align coarse to fine, see what moves, refine against the rendered static map."""
+        coarse = self._align(start.reference, current, start.T_world_camera, start.information)
         p_dynamic = self._see_movers(prior, current, coarse)
-        current = self._aligner.with_dynamic(current, p_dynamic)
-        estimate = self._refine(current, coarse, information)
-        quality = estimate.quality
-        if not self._is_good(quality):
-            return self._lost(frame, guess, p_dynamic, quality)
-        self._motion.update(frame.stamp_ns, estimate.T_world_camera, quality.covariance)
-        self._become_keyframe(frame, estimate.T_world_camera, current)
-        return _tracked(frame, estimate, True, p_dynamic, quality.overlap)
+        current = self._aligner.with_dynamic(current, p_dynamic, self._sweep(stamp_ns, coarse))
+        fine = self._refine(current, coarse, start.information)
+        return Attempt(start, current, coarse, fine, p_dynamic)
+
+    def _sweep(self, stamp_ns: int, coarse: Estimate) -> NDArray[np.float64]:
+        """Return the motion during the readout of a rolling shutter, with this frame's own."""
+        pose, covariance = coarse.T_world_camera, coarse.quality.covariance
+        return self._readout_s * self._motion.velocity_with(stamp_ns, pose, covariance)
 
     def _align(
         self,
@@ -234,109 +303,78 @@ class CameraTracker:
         fine = self._align(
             self._model, current, coarse.T_world_camera, information, fine_only=True
         )
-        return fine if self._is_good(fine.quality) else coarse
+        return coarse if self._loss.objection(fine.quality) else fine
 
-    def _is_good(self, quality: AlignResult) -> bool:
-        # A covered lens agrees with everything at gain 0.
-        return (
-            quality.inlier_ratio >= self._config.lost_inlier_ratio
-            and quality.coverage >= self._config.lost_coverage
-            and 1 / self._config.lost_gain < quality.gain < self._config.lost_gain
-        )
-
-    def _conclude(
-        self,
-        frame: RgbdFrame,
-        current: ImagePyramid,
-        overlap: float,
-        estimate: Estimate,
-        p_dynamic: ProbabilityImage,
-        predicted: Pose,
-    ) -> TrackingResult:
-        quality = estimate.quality
-        self._frames_since_keyframe += 1
-        if not self._is_good(quality):
-            return self._lost(frame, predicted, p_dynamic, quality)
-        self._motion.update(frame.stamp_ns, estimate.T_world_camera, quality.covariance)
-        is_keyframe = self._needs_keyframe(estimate.T_world_camera, overlap)
+    def _conclude(self, frame: RgbdFrame, attempt: Attempt) -> TrackingResult:
+        """Believe a pose; where the camera was lost, only one that is sure or seen twice."""
+        start, estimate = attempt.start, attempt.best
+        was_lost = self._is_lost or start.is_far
+        if was_lost and not (start.confirms or self._loss.is_sure(estimate.quality)):
+            self._hypothesis = Hypothesis(frame.stamp_ns, estimate.T_world_camera, start)
+            return self._lost(frame, attempt)
+        if was_lost:
+            _log.warning('found again at stamp %d ns', frame.stamp_ns)
+            self._motion.reset()
+            self._is_lost, self._hypothesis = False, None
+        self._motion.update(frame.stamp_ns, estimate.T_world_camera, estimate.quality.covariance)
+        self._loss.accept(estimate.quality)
+        is_keyframe = start.is_far or self._needs_keyframe(attempt)
         if is_keyframe:
-            self._become_keyframe(frame, estimate.T_world_camera, current)
-        return _tracked(frame, estimate, is_keyframe, p_dynamic, overlap)
+            self._become_keyframe(
+                frame, estimate.T_world_camera, attempt.current, attempt.p_dynamic
+            )
+        else:
+            self._places.prepare()  # in a frame that is no keyframe there is time
+        return _result(frame, attempt, TrackingStatus.OK, is_keyframe)
 
-    def _lost(
-        self,
-        frame: RgbdFrame,
-        predicted: Pose,
-        p_dynamic: ProbabilityImage,
-        quality: AlignResult,
-    ) -> TrackingResult:
-        """Report loss; the next frames try again from where the camera was last seen."""
-        _log.warning(
-            'lost at stamp %d ns: %.0f %% inliers on %.0f %% of the image, exposure gain %.2f',
-            frame.stamp_ns,
-            100 * quality.inlier_ratio,
-            100 * quality.coverage,
-            quality.gain,
-        )
-        return TrackingResult(
-            frame.stamp_ns,
-            TrackingStatus.LOST,
-            predicted,
-            quality.covariance,
-            False,
-            p_dynamic,
-            quality.inlier_ratio,
-            quality.overlap,
-        )
+    def _lose(self, frame: RgbdFrame, attempt: Attempt) -> TrackingResult:
+        """No start led anywhere: the camera is lost, or stays so."""
+        if not self._is_lost:
+            objection = self._loss.objection(attempt.best.quality)
+            _log.warning('lost at stamp %d ns: %s', frame.stamp_ns, objection)
+        self._hypothesis = None
+        return self._lost(frame, attempt)
 
-    def _needs_keyframe(self, T_world_camera: Pose, overlap: float) -> bool:
-        """
-        Choose by translation over depth, rotation, overlap and age, all against the last keyframe.
+    def _lost(self, frame: RgbdFrame, attempt: Attempt) -> TrackingResult:
+        """Report loss; what was seen from a wrong pose says nothing about the next frame."""
+        self._is_lost = True
+        self._movers.reset()
+        return _result(frame, attempt, TrackingStatus.LOST, False)
 
-        The model view may be of an older one, when mapping is behind.
-        """
+    def _needs_keyframe(self, attempt: Attempt) -> bool:
         assert self._keyframe is not None
-        rules = self._config.keyframe
-        T_keyframe_current = se3.inverse(self._keyframe.T_world_camera) @ T_world_camera
-        move = float(np.linalg.norm(T_keyframe_current[:3, 3])) / self._keyframe_depth_m
-        turn = np.rad2deg(se3.rotation_angle_rad(T_keyframe_current))
-        return bool(
-            move > rules.translation
-            or turn > rules.rotation_deg
-            or overlap < rules.overlap
-            or self._frames_since_keyframe >= rules.max_interval
-        )
+        T_keyframe_world = se3.inverse(self._keyframe.T_world_camera)
+        T_keyframe_camera = T_keyframe_world @ attempt.best.T_world_camera
+        return self._choice.is_due(T_keyframe_camera, attempt.coarse.quality.overlap)
 
     def _become_keyframe(
-        self, frame: RgbdFrame, T_world_camera: Pose, pyramid: ImagePyramid
+        self,
+        frame: RgbdFrame,
+        T_world_camera: Pose,
+        pyramid: ImagePyramid,
+        p_dynamic: ProbabilityImage,
     ) -> None:
-        self._keyframe = Reference(T_world_camera, pyramid)
+        self._keyframe = Reference(frame.stamp_ns, T_world_camera, pyramid)
         self._tracked[frame.stamp_ns] = T_world_camera
         if len(self._tracked) > _MOST_TRACKED:
             del self._tracked[min(self._tracked)]
-        self._keyframe_depth_m = _median_depth(frame.depth_m)
-        self._frames_since_keyframe = 0
+        self._choice.begin(frame)
+        self._places.add(frame, T_world_camera, p_dynamic)
 
 
-def _tracked(
-    frame: RgbdFrame,
-    estimate: Estimate,
-    is_keyframe: bool,
-    p_dynamic: ProbabilityImage,
-    overlap: float,
+def _result(
+    frame: RgbdFrame, attempt: Attempt, status: TrackingStatus, is_keyframe: bool
 ) -> TrackingResult:
+    """Return what came of a frame; a lost one has no pose but where it was looked for."""
+    found, start = attempt.best, attempt.start
+    is_ok = status is TrackingStatus.OK
     return TrackingResult(
         frame.stamp_ns,
-        TrackingStatus.OK,
-        estimate.T_world_camera,
-        estimate.quality.covariance,
+        status,
+        found.T_world_camera if is_ok else start.T_world_camera,
+        found.quality.covariance if is_ok else np.asarray(np.linalg.inv(start.information)),
         is_keyframe,
-        p_dynamic,
-        estimate.quality.inlier_ratio,
-        overlap,
+        attempt.p_dynamic,
+        found.quality.inlier_ratio,
+        attempt.coarse.quality.overlap,
     )
-
-
-def _median_depth(depth_m: NDArray[np.float32]) -> float:
-    valid = depth_m[depth_m > 0]
-    return float(np.median(valid)) if len(valid) else 1.0

@@ -157,7 +157,8 @@ class MotionPredictor:
         if self._config.model == 'none':
             noise = self._start_covariance() * dt**2
             return _State(stamp_ns, state.T_world_camera, np.zeros(6), state.covariance + noise)
-        step = se3.exp(state.velocity * dt)
+        # nobody keeps a velocity for long; unseen, the camera is not carried out of the room
+        step = se3.exp(state.velocity * min(dt, self._config.coast_s))
         F = np.eye(12)
         F[:6, :6] = adjoint(se3.inverse(step))
         F[:6, 6:] = dt * np.eye(6)

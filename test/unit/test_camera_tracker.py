@@ -8,7 +8,14 @@ import pytest
 from bdgs_ros.core import se3
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.config import BdgsConfig
-from bdgs_ros.core.types import Labels, ModelView, RgbdFrame, TrackingResult, TrackingStatus
+from bdgs_ros.core.types import (
+    Keyframe,
+    Labels,
+    ModelView,
+    RgbdFrame,
+    TrackingResult,
+    TrackingStatus,
+)
 from bdgs_ros.data.synth.render import FrameRenderer
 from bdgs_ros.data.synth.scenarios import make_world
 from bdgs_ros.tracking.camera_tracker import CameraTracker
@@ -155,3 +162,119 @@ def test_an_old_model_view_does_not_make_every_frame_a_keyframe(recording: tuple
     )
     tracker.set_model(view)
     assert not any(tracker.process(frame).is_keyframe for frame in frames[1:6])
+
+
+@pytest.fixture(scope='module')
+def two_places() -> tuple[list[RgbdFrame], list[np.ndarray]]:
+    """Six frames, a second later six more, elsewhere: stamps go on at camera rate."""
+    world = make_world('walking_halfsphere', 3, 9.0)
+    renderer = FrameRenderer(world, CAMERA, 0.01)
+    frames, poses = [], []
+    for i in range(12):
+        time_s = 1.0 + i * PERIOD_S + (2.5 if i >= 6 else 0.0)
+        images = renderer.render(time_s)
+        color = np.ascontiguousarray(images.static_color).astype(np.uint8)
+        depth = images.static_depth_m.astype(np.float32)
+        stamp_ns = round((1.0 + i * PERIOD_S) * 1e9)
+        frames.append(RgbdFrame(stamp_ns, color, depth, CAMERA))
+        poses.append(world.camera_path.pose(time_s))
+    return frames, poses
+
+
+def at(frame: RgbdFrame, i: int) -> RgbdFrame:
+    return replace(frame, stamp_ns=round((1.0 + i * PERIOD_S) * 1e9))
+
+
+def test_after_a_jump_back_the_camera_is_found_at_once_or_nearly(two_places: tuple) -> None:
+    frames, poses = two_places
+    tracker = CameraTracker(CONFIG)
+    apart = np.linalg.norm((se3.inverse(poses[0]) @ poses[11])[:3, 3])
+    assert apart > 0.2
+    elsewhere = start_elsewhere(tracker, frames, poses)
+    assert elsewhere.is_keyframe
+    results = [tracker.process(at(frames[i], 30 + i)) for i in range(6)]
+    wrong = [
+        i
+        for i, r in enumerate(results)
+        if r.status is TrackingStatus.OK and error_m(r, poses, i) > 0.05
+    ]
+    assert not wrong
+    assert all(r.status is TrackingStatus.OK for r in results[2:])
+
+
+def start_elsewhere(
+    tracker: CameraTracker, frames: list[RgbdFrame], poses: list[np.ndarray]
+) -> TrackingResult:
+    """Track the first place, then put the camera at the second as a known one."""
+    first = tracker.process(frames[0])
+    view = ModelView(
+        frames[11].stamp_ns,
+        se3.inverse(poses[0]) @ poses[11],
+        CAMERA,
+        frames[11].color,
+        frames[11].depth_m,
+        np.zeros(CAMERA.shape, np.uint8),
+    )
+    known = Keyframe(frames[0], first.T_world_camera, np.zeros(CAMERA.shape, np.uint8))
+    tracker.start_from(view, [known])
+    return tracker.process(at(frames[11], 20))
+
+
+def test_a_known_map_is_entered_anywhere(two_places: tuple) -> None:
+    """The view is of one place, the camera at another, of which the map has a keyframe."""
+    frames, poses = two_places
+    tracker = CameraTracker(CONFIG)
+    view = ModelView(
+        0,
+        se3.inverse(poses[0]) @ poses[11],
+        CAMERA,
+        frames[11].color,
+        frames[11].depth_m,
+        np.zeros(CAMERA.shape, np.uint8),
+    )
+    known = Keyframe(frames[0], np.eye(4), np.zeros(CAMERA.shape, np.uint8))
+    tracker.start_from(view, [known])
+    results = [tracker.process(frames[i]) for i in (1, 2, 3)]
+    found = [i for i, r in enumerate(results, 1) if r.status is TrackingStatus.OK]
+    assert found and found[0] <= 2
+    assert all(error_m(results[i - 1], poses, i) < 0.02 for i in found)
+    assert results[found[0] - 1].is_keyframe
+
+
+def test_a_correction_moves_everything_that_is_known(recording: tuple) -> None:
+    frames, _ = recording
+    corrected, plain = CameraTracker(CONFIG), CameraTracker(CONFIG)
+    for frame in frames[:4]:
+        corrected.process(frame)
+        plain.process(frame)
+    T_new_old = se3.exp(np.array([0.5, -0.2, 0.1, 0.1, 0.2, -0.1]))
+    corrected.correct_poses({frames[0].stamp_ns: T_new_old})
+    one, other = corrected.process(frames[4]), plain.process(frames[4])
+    expected = T_new_old @ other.T_world_camera
+    np.testing.assert_allclose(one.T_world_camera, expected, atol=1e-6)
+
+
+def test_a_correction_of_later_keyframes_leaves_the_present(recording: tuple) -> None:
+    frames, _ = recording
+    tracker = CameraTracker(CONFIG)
+    before = tracker.process(frames[0])
+    tracker.correct_poses({frames[9].stamp_ns: se3.exp(np.ones(6))})
+    after = tracker.process(frames[1])
+    assert np.linalg.norm(after.T_world_camera[:3, 3] - before.T_world_camera[:3, 3]) < 0.05
+
+
+def test_while_lost_no_pose_is_made_up(recording: tuple) -> None:
+    """The prediction stays where the camera was last seen, and grows uncertain."""
+    frames, _ = recording
+    tracker = CameraTracker(CONFIG)
+    for frame in frames[:6]:
+        last = tracker.process(frame)
+    blank = np.full_like(frames[0].color, 128), np.zeros_like(frames[0].depth_m)
+    lost = [
+        tracker.process(replace(at(frames[0], 60 + i), color=blank[0], depth_m=blank[1]))
+        for i in range(3)
+    ]
+    assert all(r.status is TrackingStatus.LOST for r in lost)
+    moved = se3.inverse(last.T_world_camera) @ lost[-1].T_world_camera
+    assert np.linalg.norm(moved[:3, 3]) < 0.1
+    assert np.sqrt(lost[-1].covariance[0, 0]) > 0.5

@@ -125,3 +125,12 @@ def test_adjoint_moves_a_tangent_to_the_other_side() -> None:
     T = se3.exp(np.array([0.3, -0.2, 0.5, 0.4, 0.1, -0.6]))
     xi = np.array([0.01, 0.02, -0.01, 0.03, -0.02, 0.01])
     assert np.allclose(T @ se3.exp(xi), se3.exp(adjoint(T) @ xi) @ T)
+
+
+def test_an_unseen_camera_does_not_run_away() -> None:
+    predictor = MotionPredictor(MotionConfig(coast_s=0.2))
+    follow(predictor, 20)
+    far = [predictor.predict((19 + k) * PERIOD_NS)[0] for k in (6, 30, 300)]
+    assert np.allclose(far[1], far[2])
+    travelled = np.linalg.norm(se3.log(se3.inverse(pose_at(19)) @ far[2])[:3])
+    assert travelled == pytest.approx(0.2 * np.linalg.norm(VELOCITY[:3]), rel=0.01)

@@ -1,0 +1,94 @@
+"""
+Whether a pose can be believed: the calibrated test for loss.
+
+A frame that is aligned to the wrong place still agrees with much of it: walls are walls. What
+tells is that it agrees clearly less than the frames before it did, whatever the sensor, the map
+and the people make usual. The limits of `LossConfig` say on what they were calibrated.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from bdgs_ros.core.config.tracking import LossConfig
+from bdgs_ros.tracking.align import AlignResult
+
+_MEMORY = 20  # frames that say what is usual
+_LEAST_MEMORY = 3
+_USUAL = 0.8  # inlier ratio, where no frame was tracked yet
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What an alignment says about itself."""
+
+    inlier_ratio: float
+    relative_ratio: float
+    """Over what is usual."""
+    coverage: float
+    gain: float
+    sigma_m: float
+    """Standard deviation of the position along its weakest axis, from the images alone."""
+
+
+class LossTest:
+    """
+    Judges alignments by limits and by what was usual in the last frames.
+
+    Parameters
+    ----------
+    config : LossConfig
+        The limits.
+
+    """
+
+    def __init__(self, config: LossConfig) -> None:
+        self._config = config
+        self._ratios: deque[float] = deque(maxlen=_MEMORY)
+
+    def reset(self) -> None:
+        """Forget what was usual."""
+        self._ratios.clear()
+
+    def accept(self, quality: AlignResult) -> None:
+        """Take an alignment that is believed as an example of what is usual."""
+        self._ratios.append(quality.inlier_ratio)
+
+    def evidence(self, quality: AlignResult) -> Evidence:
+        """Return what the test looks at."""
+        variance = float(np.linalg.eigvalsh(quality.covariance[:3, :3])[-1])
+        return Evidence(
+            quality.inlier_ratio,
+            quality.inlier_ratio / max(self._usual(), 1e-6),
+            quality.coverage,
+            quality.gain,
+            float(np.sqrt(max(variance, 0.0))),
+        )
+
+    def _usual(self) -> float:
+        return float(np.median(self._ratios)) if len(self._ratios) >= _LEAST_MEMORY else _USUAL
+
+    def objection(self, quality: AlignResult) -> str:
+        """Say in words why a pose is not to be believed; nothing where it is."""
+        limits, found = self._config, self.evidence(quality)
+        # A covered lens agrees with everything at gain 0.
+        if not 1 / limits.gain < found.gain < limits.gain:
+            return f'exposure gain {found.gain:.2f}'
+        if found.coverage < limits.coverage:
+            return f'only {100 * found.coverage:.1f} % of the image could be compared'
+        if found.inlier_ratio < limits.inlier_ratio:
+            return f'{100 * found.inlier_ratio:.0f} % inliers'
+        if self._ratios and found.relative_ratio < limits.relative_ratio:
+            return (
+                f'inliers fell from {100 * self._usual():.0f} to {100 * found.inlier_ratio:.0f} %'
+            )
+        if found.sigma_m > limits.sigma_m:
+            return f'the images leave the position open to {found.sigma_m:.2f} m'
+        return ''
+
+    def is_sure(self, quality: AlignResult) -> bool:
+        """Tell whether one such frame is enough to be found after a loss."""
+        return self.evidence(quality).relative_ratio >= self._config.sure_ratio

@@ -1,0 +1,259 @@
+"""
+Keyframes by which a lost camera finds where it is: retrieval by binary words, then geometry.
+
+An ORB descriptor is hashed by a few random choices of its bits; each hash is a word. Images of
+one place share rare words, which an inverse-frequency vote finds in about a millisecond. It is the
+bag of words of Galvez-Lopez and Tardos (TRO 2012) with hashes in place of a trained vocabulary.
+The likeliest places are matched feature by feature, and PnP with RANSAC says where the camera is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bdgs_ros.core import se3
+from bdgs_ros.core.camera import PinholeCamera
+from bdgs_ros.core.config.tracking import FeatureConfig, PlacesConfig
+from bdgs_ros.core.types import Pose, ProbabilityImage, RgbdFrame
+from bdgs_ros.tracking.features import FeatureExtractor, Features, match
+from bdgs_ros.tracking.pnp import locate
+from bdgs_ros.tracking.starts import Transform
+
+_TABLES, _BITS = 8, 12  # of the hash: words per feature, and bits of each
+_METRES_PER_RADIAN = 2.0  # a turn moves the view as far as this at usual depths
+
+
+@dataclass(frozen=True)
+class Place:
+    """A keyframe, small, as it is remembered."""
+
+    stamp_ns: int
+    T_world_camera: Pose
+    camera: PinholeCamera
+    grey: NDArray[np.uint8]
+    depth_m: NDArray[np.float16]
+    p_dynamic: ProbabilityImage
+    features: Features | None = None
+    """None until somebody had the time."""
+    words: NDArray[np.int64] | None = None
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """A place that the camera may see, and where the camera would be."""
+
+    place: Place
+    T_world_camera: Pose
+    inliers: int
+    """Matches that agree on the pose."""
+
+
+class Places:
+    """
+    The data base of keyframes.
+
+    Parameters
+    ----------
+    config : PlacesConfig
+        How many are remembered, and what counts as recognised.
+    features : FeatureConfig
+        Of the descriptors and their matching; the count is that of `config`.
+
+    """
+
+    def __init__(self, config: PlacesConfig, features: FeatureConfig) -> None:
+        self._config = config
+        self._matching = replace(features, count=config.features)
+        self._extractor = FeatureExtractor(self._matching)
+        self._hash = _WordHash()
+        self._places: list[Place] = []
+
+    def clear(self) -> None:
+        """Forget all."""
+        self._places = []
+
+    def __len__(self) -> int:
+        """Return the number of places."""
+        return len(self._places)
+
+    def __iter__(self) -> Iterator[Place]:
+        """List the places, oldest first."""
+        return iter(self._places)
+
+    def add(self, frame: RgbdFrame, T_world_camera: Pose, p_dynamic: ProbabilityImage) -> None:
+        """
+        Remember a keyframe; its features are extracted later, see `prepare`.
+
+        Parameters
+        ----------
+        frame : RgbdFrame
+            Rectified.
+        T_world_camera : ndarray, shape (4, 4)
+            Its pose.
+        p_dynamic : ndarray, shape (H, W), uint8
+            P(dynamic) x 255; what may move is no landmark.
+
+        """
+        self._places.append(_shrink(frame, T_world_camera, p_dynamic, self._config.width))
+        if len(self._places) > self._config.count:
+            del self._places[_most_redundant(self._places)]
+
+    def move(self, transform: Transform) -> None:
+        """
+        Follow a correction of the world.
+
+        Parameters
+        ----------
+        transform : callable
+            Gives `T_new_old` in world of the keyframe with a stamp (ns), None where it stays.
+
+        """
+        for i, place in enumerate(self._places):
+            T_new_old = transform(place.stamp_ns)
+            if T_new_old is not None:
+                moved = se3.orthonormalise(T_new_old @ place.T_world_camera)
+                self._places[i] = replace(place, T_world_camera=moved)
+
+    def prepare(self, most: int = 1) -> None:
+        """Extract the features of so many places that have none yet."""
+        for i, place in enumerate(self._places):
+            if place.features is None and most > 0:
+                self._places[i] = self._prepared(place)
+                most -= 1
+
+    def _prepared(self, place: Place) -> Place:
+        frame = RgbdFrame(
+            place.stamp_ns,
+            np.asarray(cv2.cvtColor(place.grey, cv2.COLOR_GRAY2RGB), np.uint8),
+            place.depth_m.astype(np.float32),
+            place.camera,
+        )
+        features = self._extractor.extract(frame, place.p_dynamic)
+        return replace(place, features=features, words=self._hash.words(features.descriptors))
+
+    def find(self, frame: RgbdFrame, p_dynamic: ProbabilityImage) -> list[Sighting]:
+        """
+        Recognise where a frame was taken.
+
+        Parameters
+        ----------
+        frame : RgbdFrame
+            Rectified.
+        p_dynamic : ndarray, shape (H, W), uint8
+            P(dynamic) x 255.
+
+        Returns
+        -------
+        sightings : list of Sighting
+            Those with enough matches that agree on a pose, the most first.
+
+        """
+        self.prepare(len(self._places))
+        query = self._prepared(_shrink(frame, se3.identity(), p_dynamic, self._config.width))
+        likely = self._likely(query)
+        seen = [s for s in (self._look(place, query) for place in likely) if s is not None]
+        return sorted(seen, key=lambda sighting: -sighting.inliers)
+
+    def _likely(self, query: Place) -> list[Place]:
+        """Return the places that share the rarest words with the query, the best first."""
+        known = [p.words for p in self._places if p.words is not None]
+        if query.words is None or not query.words.size or not known:
+            return []
+        sizes = np.array([words.size for words in known])
+        votes = self._hash.votes(query.words, np.concatenate(known), sizes)
+        order = np.argsort(-votes, kind='stable')[: self._config.candidates]
+        return [self._places[i] for i in order if votes[i] > 0]
+
+    def _look(self, place: Place, query: Place) -> Sighting | None:
+        """Match feature by feature, and locate the camera."""
+        assert place.features is not None and query.features is not None
+        pairs = match(place.features, query.features, self._matching)
+        if len(pairs) < self._config.min_inliers:
+            return None
+        found = locate(
+            place.features.points_camera[pairs[:, 0]],
+            query.features.pixels[pairs[:, 1]],
+            query.camera,
+            self._config.tolerance_px,
+        )
+        if found is None or len(found.inliers) < self._config.min_inliers:
+            return None
+        T_place_camera = se3.inverse(found.T_current_reference)
+        return Sighting(place, place.T_world_camera @ T_place_camera, len(found.inliers))
+
+
+class _WordHash:
+    """Words of descriptors: random choices of their bits, the same in every run."""
+
+    def __init__(self) -> None:
+        rng = np.random.default_rng(0)
+        bits = 256  # of an ORB descriptor
+        self._bits = np.stack([rng.choice(bits, _BITS, replace=False) for _ in range(_TABLES)])
+        self._size = _TABLES << _BITS
+
+    def words(self, descriptors: NDArray[np.uint8]) -> NDArray[np.int64]:
+        """Return the words of descriptors, shape (N, 32), as numbers, shape (N * tables,)."""
+        bits = np.unpackbits(descriptors, axis=1)[:, self._bits].astype(np.int64)
+        return np.asarray((bits @ (1 << np.arange(_BITS)) + self._first()).ravel(), np.int64)
+
+    def _first(self) -> NDArray[np.int64]:
+        return np.arange(_TABLES) << _BITS
+
+    def votes(
+        self, query: NDArray[np.int64], words: NDArray[np.int64], sizes: NDArray[np.int64]
+    ) -> NDArray[np.float64]:
+        """
+        Say how much each image shares with a query, rare words counting more.
+
+        Parameters
+        ----------
+        query : ndarray, shape (Q,)
+            Words of the query.
+        words : ndarray, shape (W,)
+            Words of all images, one image after the other.
+        sizes : ndarray, shape (K,)
+            Words of each image.
+
+        """
+        frequency = np.bincount(words, minlength=self._size)
+        weight = np.zeros(self._size)
+        weight[query] = np.log1p(len(words) / np.maximum(frequency[query], 1))
+        owner = np.repeat(np.arange(len(sizes)), sizes)
+        shared = np.bincount(owner, weight[words], len(sizes))
+        return np.asarray(shared / np.sqrt(np.maximum(sizes, 1)))
+
+
+def _shrink(
+    frame: RgbdFrame, T_world_camera: Pose, p_dynamic: ProbabilityImage, width: int
+) -> Place:
+    camera = frame.camera.scaled(min(1.0, width / frame.camera.width))
+    size = (camera.width, camera.height)
+    image = cv2.resize(
+        cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA
+    )
+    depth_m = cv2.resize(frame.depth_m, size, interpolation=cv2.INTER_NEAREST)
+    moving = cv2.resize(p_dynamic, size, interpolation=cv2.INTER_NEAREST)
+    return Place(
+        frame.stamp_ns,
+        T_world_camera,
+        camera,
+        np.asarray(image, np.uint8),
+        np.asarray(depth_m, np.float16),
+        np.asarray(moving, np.uint8),
+    )
+
+
+def _most_redundant(places: list[Place]) -> int:
+    """Return which place is nearest to another one; the newest is never it."""
+    centres = np.array([p.T_world_camera[:3, 3] for p in places])
+    axes = np.array([p.T_world_camera[:3, 2] for p in places])
+    apart = np.linalg.norm(centres[:, None] - centres, axis=2)
+    turned = np.arccos(np.clip(axes @ axes.T, -1, 1))
+    distance = apart + _METRES_PER_RADIAN * turned
+    np.fill_diagonal(distance, np.inf)
+    return int(np.argmin(distance[:-1].min(axis=1)))

@@ -1,0 +1,61 @@
+"""A covered lens in the graph: LOST is said, no pose is published, and the camera comes back."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='needs rclpy')
+pytestmark = [pytest.mark.ros, pytest.mark.slow]
+
+from graph_processes import Graph  # noqa: E402
+
+from bdgs_ros.data.convert import convert  # noqa: E402
+from bdgs_ros.data.synth.writer import write_recording  # noqa: E402
+from bdgs_ros.data.trajectory_io import read_trajectory  # noqa: E402
+
+FRAMES = 22
+COVERED = range(8, 14)
+
+
+@pytest.fixture(scope='module')
+def covered_bag(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[int]]:
+    """Put a lid on the lens for a few frames; returns the bag and all stamps (ns)."""
+    folder = tmp_path_factory.mktemp('covered')
+    write_recording(folder / 'synth', 'static', 5, FRAMES, size=(320, 240), jobs=1)
+    for kind in ('rgb', 'depth'):
+        files = sorted((folder / 'synth' / kind).glob('*.png'))
+        for i in COVERED:
+            image = cv2.imread(str(files[i]), cv2.IMREAD_UNCHANGED)
+            dark = np.zeros_like(image)
+            dark[:20, :20] = 5000 if kind == 'depth' else 0  # no depth at all would be skipped
+            cv2.imwrite(str(files[i]), dark)
+    convert(folder / 'synth', folder / 'bag')
+    truth = read_trajectory(folder / 'synth' / 'groundtruth.txt')
+    return folder / 'bag', truth.stamps_ns.tolist()
+
+
+def test_a_covered_lens_in_the_graph(
+    graph: Graph,
+    covered_bag: tuple[Path, list[int]],
+    settings: dict[str, object],
+    tmp_path: Path,
+) -> None:
+    bag, stamps_ns = covered_bag
+    out = tmp_path / 'out'
+    slam = graph.node(
+        'slam_node', bag=bag, output=out, exit_at_end=True, mode='lockstep', **settings
+    )
+    assert slam.wait(120.0) == 0, slam.text()
+    found = read_trajectory(out / 'trajectory.txt')
+    expected = [s for i, s in enumerate(stamps_ns) if i not in COVERED]
+    assert found.stamps_ns.tolist() == expected
+    report = json.loads((out / 'metrics.json').read_text())
+    assert report['nodes']['tracking']['frames_lost'] == str(len(COVERED))
+    assert report['metrics']['frames_lost']['value'] == len(COVERED)
+    assert report['metrics']['ate_rmse']['value'] < 2.0
+    assert f'{len(COVERED)} lost' in slam.text()

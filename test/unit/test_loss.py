@@ -1,0 +1,63 @@
+"""The test for loss: limits, and what was usual before."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bdgs_ros.core import se3
+from bdgs_ros.core.config.tracking import LossConfig
+from bdgs_ros.tracking.align import AlignResult
+from bdgs_ros.tracking.loss import LossTest
+
+
+def aligned(
+    inliers: float = 0.9, coverage: float = 0.7, gain: float = 1.0, sigma_m: float = 0.01
+) -> AlignResult:
+    covariance = np.diag([1e-6, 1e-6, sigma_m**2, 1e-8, 1e-8, 1e-8])
+    return AlignResult(
+        se3.identity(), covariance, inliers, coverage, 0.9, 0.01, 0.5, 5, True, gain, 0.0,
+        np.zeros(3),
+    )  # fmt: skip
+
+
+def usual(ratio: float) -> LossTest:
+    test = LossTest(LossConfig())
+    for _ in range(10):
+        test.accept(aligned(ratio))
+    return test
+
+
+def test_a_good_frame_is_believed() -> None:
+    assert usual(0.9).objection(aligned(0.85)) == ''
+    assert LossTest(LossConfig()).objection(aligned(0.55)) == ''
+
+
+@pytest.mark.parametrize(
+    ('quality', 'word'),
+    [
+        (aligned(inliers=0.45), '45 % inliers'),
+        (aligned(inliers=0.6), 'fell from 90 to 60 %'),
+        (aligned(coverage=0.03), '3.0 % of the image'),
+        (aligned(gain=0.05), 'gain 0.05'),
+        (aligned(gain=-0.8), 'gain -0.80'),
+        (aligned(gain=3.5), 'gain 3.50'),
+        (aligned(sigma_m=0.4), '0.40 m'),
+    ],
+)
+def test_each_limit_objects_in_words(quality: AlignResult, word: str) -> None:
+    assert word in usual(0.9).objection(quality)
+
+
+def test_what_is_usual_decides_what_is_too_little() -> None:
+    """A noisy sensor agrees less with every map; that is no loss."""
+    assert usual(0.9).objection(aligned(0.6))
+    assert not usual(0.65).objection(aligned(0.6))
+
+
+def test_sure_is_as_good_as_before_the_loss() -> None:
+    test = usual(0.9)
+    assert test.is_sure(aligned(0.85))
+    assert not test.is_sure(aligned(0.75))
+    test.reset()
+    assert test.is_sure(aligned(0.75))
