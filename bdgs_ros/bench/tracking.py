@@ -33,14 +33,13 @@ of the keyframes found. ATE over the frames with a pose, online, as in bench sla
 """
 TABLES = {
     'Alone': (
-        *('sequence', 'configuration', 'frames', 'ate_rmse_cm', 'tracking_ms', 'tracking_p95_ms'),
+        *('alone_ate_cm', 'alone_ms', 'alone_p95_ms'),
         *(f'{part}_ms' for part in ('load', *PARTS, 'rest')),
     ),
     'Live': (
-        *('sequence', 'configuration', 'frames', 'tracked_percent', 'dropped', 'lost'),
-        *('ate_rmse_cm', 'ate_max_cm', 'tracking_ms', 'tracking_p95_ms', 'latency_ms'),
-        *('latency_p95_ms', 'labels_age_ms', 'labels', 'keyframes', 'keyframes_mapped'),
-        'mapping_ms',
+        *('frames', 'tracked_percent', 'dropped', 'lost', 'ate_rmse_cm', 'ate_max_cm'),
+        *('tracking_ms', 'tracking_p95_ms', 'latency_ms', 'latency_p95_ms', 'labels_age_ms'),
+        *('labels', 'keyframes', 'keyframes_mapped', 'mapping_ms'),
     ),
 }
 
@@ -113,7 +112,7 @@ def _alone(recording: Path, cell: Cell, options: Options) -> dict[str, Any]:
             if result.status is TrackingStatus.OK:
                 poses.append(StampedPose(result.stamp_ns, result.T_world_camera))
     errors = ate(sequence.ground_truth, Trajectory(tuple(poses))).statistics
-    return {'frames': count, 'ate_rmse_cm': 100 * errors.rmse, **part_columns(rows)}
+    return {'alone_ate_cm': 100 * errors.rmse, **part_columns(rows)}
 
 
 def part_columns(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
@@ -123,8 +122,8 @@ def part_columns(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
     rest = times['all'] - sum(times[name] for name in PARTS)
     columns = {f'{name}_ms': float(np.median(times[name])) for name in names}
     columns['rest_ms'] = float(np.median(rest))
-    columns['tracking_ms'] = float(np.median(times['all']))
-    columns['tracking_p95_ms'] = float(np.percentile(times['all'], 95))
+    columns['alone_ms'] = float(np.median(times['all']))
+    columns['alone_p95_ms'] = float(np.percentile(times['all'], 95))
     return columns
 
 
@@ -207,5 +206,5 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         for column in columns:
             values = [row[column] for row in own if row.get(column) is not None]
             if values:
-                summary[f'{key[0]}_{key[1]}_{column}'] = float(np.median(values))
+                summary[f'{key[0]}_{column}'] = float(np.median(values))
     return summary

@@ -49,7 +49,7 @@ def test_what_others_do_with_an_aligner_is_not_tracking() -> None:
 def test_rest_is_what_no_part_has() -> None:
     rows = [{'all': 10.0, 'coarse': 4.0, 'refine': 3.0, 'load': 5.0}] * 3
     columns = tracking.part_columns(rows)
-    assert columns['tracking_ms'] == 10.0
+    assert columns['alone_ms'] == 10.0
     assert columns['rest_ms'] == 3.0
     assert columns['load_ms'] == 5.0
 
