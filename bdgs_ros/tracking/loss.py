@@ -48,28 +48,29 @@ class LossTest:
     def __init__(self, config: LossConfig) -> None:
         self._config = config
         self._ratios: deque[float] = deque(maxlen=_MEMORY)
+        self._usual = _USUAL
 
     def reset(self) -> None:
         """Forget what was usual."""
         self._ratios.clear()
+        self._usual = _USUAL
 
     def accept(self, quality: AlignResult) -> None:
         """Take an alignment that is believed as an example of what is usual."""
         self._ratios.append(quality.inlier_ratio)
+        if len(self._ratios) >= _LEAST_MEMORY:
+            self._usual = float(np.median(self._ratios))
 
     def evidence(self, quality: AlignResult) -> Evidence:
         """Return what the test looks at."""
         variance = float(np.linalg.eigvalsh(quality.covariance[:3, :3])[-1])
         return Evidence(
             quality.inlier_ratio,
-            quality.inlier_ratio / max(self._usual(), 1e-6),
+            quality.inlier_ratio / max(self._usual, 1e-6),
             quality.coverage,
             quality.gain,
             float(np.sqrt(max(variance, 0.0))),
         )
-
-    def _usual(self) -> float:
-        return float(np.median(self._ratios)) if len(self._ratios) >= _LEAST_MEMORY else _USUAL
 
     def objection(self, quality: AlignResult) -> str:
         """Say in words why a pose is not to be believed; nothing where it is."""
@@ -82,9 +83,7 @@ class LossTest:
         if found.inlier_ratio < limits.inlier_ratio:
             return f'{100 * found.inlier_ratio:.0f} % inliers'
         if self._ratios and found.relative_ratio < limits.relative_ratio:
-            return (
-                f'inliers fell from {100 * self._usual():.0f} to {100 * found.inlier_ratio:.0f} %'
-            )
+            return f'inliers fell from {100 * self._usual:.0f} to {100 * found.inlier_ratio:.0f} %'
         if found.sigma_m > limits.sigma_m:
             return f'the images leave the position open to {found.sigma_m:.2f} m'
         return ''

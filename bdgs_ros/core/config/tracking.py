@@ -137,11 +137,11 @@ class LossConfig:
     """
     When a pose is not to be believed.
 
-    Calibrated on seven synthetic and two real recordings: the evidence of their good frames,
-    also blurred by hand (2961), against that of frames which belong elsewhere (719, more than
-    0.1 m or 15 degrees away). Of the good ones 0.2 % are called lost, most of them by their
-    movers; of the others 5 % are believed, all within 0.22 m. Each limit alone is laxer than
-    what good frames reached. `bdgs bench recovery` prints the two distributions.
+    Calibrated on eight synthetic and two real recordings: the evidence of their good frames,
+    some blurred by hand (3607), against that of wrong poses (809, more than 0.1 m off, of frames
+    shown that belong up to 0.8 m or 48 degrees away). Of the good ones 0.3 % are called lost; of
+    the wrong ones 4 % are believed, all within 0.25 m. `bdgs bench recovery` prints the two
+    distributions, docs/tracking.md has more.
     """
 
     inlier_ratio: float = param(
