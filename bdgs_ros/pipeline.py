@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from bdgs_ros.back_end.back_end import BackEnd
@@ -23,6 +23,7 @@ from bdgs_ros.detection.stage import DetectionStage
 from bdgs_ros.mapping.entrance import check_entrance, entrance
 from bdgs_ros.mapping.mapper import Mapper
 from bdgs_ros.tracking.camera_tracker import CameraTracker
+from bdgs_ros.tracking.shutter import straightened
 
 
 @dataclass(frozen=True)
@@ -124,10 +125,10 @@ def take_keyframe(back_end: BackEnd, mapper: Mapper, keyframe: Keyframe) -> Mode
     """
     if mapper.frozen:
         return mapper.process(keyframe)
-    tracked = keyframe.T_world_camera
+    stamp_ns, tracked = keyframe.frame.stamp_ns, keyframe.T_world_camera
     transforms = back_end.process(keyframe, mapper.keyframe_poses())
-    if not transforms:
-        return mapper.process(keyframe)
     mapper.correct_poses(transforms)
-    corrected = transforms[keyframe.frame.stamp_ns] @ tracked
-    return mapper.process(replace(keyframe, T_world_camera=corrected), tracked)
+    mapper.readout_s = back_end.calibration.readout_s
+    corrected = transforms[stamp_ns] @ tracked if transforms else tracked
+    frame, p_dynamic = straightened(keyframe.frame, keyframe.p_dynamic, back_end.sweep(stamp_ns))
+    return mapper.process(Keyframe(frame, corrected, p_dynamic), tracked)

@@ -111,6 +111,11 @@ class BackEnd:
         self._drop_redundant()
         return transforms
 
+    def sweep(self, stamp_ns: int) -> Array:
+        """Return the motion while a keyframe was read out, (rho, phi) in its frame, [6]."""
+        view = self._views.get(stamp_ns)
+        return np.zeros(6) if view is None else self.calibration.readout_s * view.twist
+
     def _twist(self, stamp_ns: int, T_world_camera: Pose) -> Array:
         """Return the velocity since the frame before, in the camera's frame, [6]."""
         earlier = [entry for entry in self._recent if entry[0] < stamp_ns]

@@ -56,6 +56,8 @@ class KeyframeSet:
     depth_bend: DepthBend = field(default_factory=DepthBend)
     """Of the depth sensor; the depth of the keyframes is without it."""
     next_index: int = 0
+    readout_s: float | None = None
+    """Of the camera's rolling shutter; the images of the keyframes are without it."""
 
 
 def write_keyframes(folder: Path, kept: KeyframeSet, gaussians: int) -> None:
@@ -91,6 +93,7 @@ def write_keyframes(folder: Path, kept: KeyframeSet, gaussians: int) -> None:
             'history': kept.history.to_document(),
             'vignette': list(kept.vignette.coefficients),
             'depth_bend': list(kept.depth_bend.coefficients),
+            'readout_s': kept.readout_s,
         },
         'frames': frames,
     }
@@ -177,13 +180,16 @@ def read_keyframes(folder: Path, levels: int) -> KeyframeSet:
         for keyframe in keyframes:
             keyframe.depth_bend = depth_bend.coefficients
         next_index = int(own['next_index'])
+        readout = own.get('readout_s')
+        readout_s = None if readout is None else float(readout)
     except (KeyError, TypeError, ValueError) as error:
         raise MapError(
             f"'{folder / TRANSFORMS}' is damaged: {type(error).__name__} {error}; "
             f"remove '{folder}' to use the map without its keyframes"
         ) from error
     newest = max((keyframe.index for keyframe in keyframes), default=-1)
-    return KeyframeSet(keyframes, history, vignette, depth_bend, max(next_index, newest + 1))
+    count = max(next_index, newest + 1)
+    return KeyframeSet(keyframes, history, vignette, depth_bend, count, readout_s)
 
 
 def _read_document(folder: Path) -> dict[str, Any]:

@@ -88,6 +88,8 @@ class Mapper:
         """Serial numbers of what the last keyframe took out because it moved or never was."""
         self.keyframes: list[MapKeyframe] = []
         self.history = History()
+        self.readout_s: float | None = None
+        """What is known of the camera's rolling shutter; told to tracking with every view."""
         self.vignette = Vignette()
         self.depth_bend = DepthBend()
         self._photos: list[Photo] = []
@@ -382,6 +384,7 @@ class Mapper:
             np.where(known[..., None], np.clip(color * 255 + 0.5, 0, 255), 0).astype(np.uint8),
             np.where(known, static.depth / safe, 0).astype(np.float32),
             _to_probability_image(np.asarray(static.p_dynamic / safe, np.float32)),
+            self.readout_s,
         )
 
     def photographs(self) -> Iterator[Keyframe]:
@@ -413,7 +416,12 @@ class Mapper:
         for keyframe in self.keyframes:
             self.depth_bend.renew(keyframe)
         kept = KeyframeSet(
-            self.keyframes, self.history, self.vignette, self.depth_bend, self._count
+            self.keyframes,
+            self.history,
+            self.vignette,
+            self.depth_bend,
+            self._count,
+            self.readout_s,
         )
         save_map(Path(path), self.map, kept if keyframes else None)
 
@@ -435,6 +443,7 @@ class Mapper:
         self.keyframes = list(kept.keyframes)
         self.history, self.vignette = kept.history, kept.vignette
         self.depth_bend = kept.depth_bend
+        self.readout_s = kept.readout_s
         self._count = kept.next_index
 
 
