@@ -1,4 +1,4 @@
-"""The feedback from mapping to tracking: a `ModelView` as three images and a pose of one stamp."""
+"""The feedback from mapping to tracking: a `ModelView` as messages of one stamp."""
 
 from __future__ import annotations
 
@@ -6,20 +6,29 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped
 from rclpy.node import Node
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import Image, TimeReference
+from std_msgs.msg import Header
 
 from bdgs_ros.bridge import conversions, topics
 from bdgs_ros.bridge.stamped import Assembler
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.types import ModelView
+from bdgs_ros.data.trajectory_io import seconds_to_ns
 
+_NS_PER_S = 1_000_000_000
 _IMAGES = (topics.MODEL_IMAGE, topics.MODEL_DEPTH, topics.MODEL_DYNAMIC)
-_TYPES: dict[str, Any] = {**dict.fromkeys(_IMAGES, Image), topics.MODEL_POSE: PoseStamped}
+_TYPES: dict[str, Any] = {
+    **dict.fromkeys(_IMAGES, Image),
+    topics.MODEL_POSE: PoseStamped,
+    topics.MODEL_READOUT: TimeReference,
+}
+_MEASURED = 'measured'
 
 ModelMessages = dict[str, Any]
-"""By topic: three Image and a PoseStamped."""
+"""By topic: three Image, a PoseStamped, and a TimeReference: how long the shutter reads out."""
 
 
 class ModelPublisher:
@@ -44,6 +53,7 @@ class ModelPublisher:
                 topics.MODEL_DEPTH: conversions.depth_to_message(view.depth_m, head),
                 topics.MODEL_DYNAMIC: conversions.probability_to_message(view.p_dynamic, head),
                 topics.MODEL_POSE: pose,
+                topics.MODEL_READOUT: readout_to_message(view.readout_s, head),
             }
         for topic, message in messages.items():
             self._publishers[topic].publish(message)
@@ -116,4 +126,21 @@ def decode_model(
             np.float32, copy=False
         ),
         conversions.probability_from_message(messages[topics.MODEL_DYNAMIC], topics.MODEL_DYNAMIC),
+        readout_from_message(messages[topics.MODEL_READOUT]),
     )
+
+
+def readout_to_message(readout_s: float | None, head: Header) -> TimeReference:
+    """Return the time from first row to last; its `source` is empty while it is unknown."""
+    if readout_s is None:
+        return TimeReference(header=head)
+    seconds, nanoseconds = divmod(seconds_to_ns(readout_s), _NS_PER_S)
+    time_ref = Time(sec=seconds, nanosec=nanoseconds)
+    return TimeReference(header=head, time_ref=time_ref, source=_MEASURED)
+
+
+def readout_from_message(message: TimeReference) -> float | None:
+    """Undo `readout_to_message`."""
+    if message.source != _MEASURED:
+        return None
+    return float(message.time_ref.sec + 1e-9 * message.time_ref.nanosec)

@@ -22,6 +22,7 @@ MODEL_IMAGE = 'bdgs/model/image'
 MODEL_DEPTH = 'bdgs/model/depth'
 MODEL_DYNAMIC = 'bdgs/model/dynamic'
 MODEL_POSE = 'bdgs/model/pose'
+MODEL_READOUT = 'bdgs/model/readout'
 """Where mapping now knows the keyframe to be that the model images show."""
 RENDERED_IMAGE = 'bdgs/rendered/image'
 RENDERED_DEPTH = 'bdgs/rendered/depth'

@@ -8,12 +8,12 @@ import pytest
 pytest.importorskip('rclpy', reason='needs rclpy')
 pytestmark = pytest.mark.ros
 
-from sensor_msgs.msg import CameraInfo, Image  # noqa: E402
+from sensor_msgs.msg import CameraInfo, Image, TimeReference  # noqa: E402
 
 from bdgs_ros.bridge import conversions, topics  # noqa: E402
 from bdgs_ros.bridge.cloud import cloud_from_map  # noqa: E402
 from bdgs_ros.bridge.frames import FrameDecoder, RawFrame  # noqa: E402
-from bdgs_ros.bridge.model_view import decode_model  # noqa: E402
+from bdgs_ros.bridge.model_view import decode_model, readout_from_message, readout_to_message  # noqa: E402
 from bdgs_ros.bridge.status import (  # noqa: E402
     FrameState,
     FrameStatus,
@@ -178,6 +178,7 @@ def test_model_view_round_trip(rng: np.random.Generator) -> None:
         topics.MODEL_DEPTH: conversions.depth_to_message(depth, HEAD),
         topics.MODEL_DYNAMIC: conversions.probability_to_message(p_dynamic, HEAD),
         topics.MODEL_POSE: conversions.pose_stamped(pose, 7, 'map'),
+        topics.MODEL_READOUT: readout_to_message(-0.0255, HEAD),
     }
     camera = PinholeCamera(6, 4, 5.0, 5.0, 2.5, 1.5)
     view = decode_model(7, images, camera)
@@ -187,6 +188,12 @@ def test_model_view_round_trip(rng: np.random.Generator) -> None:
     assert np.array_equal(view.color, color)
     assert np.array_equal(view.depth_m, depth)
     assert np.array_equal(view.p_dynamic, p_dynamic)
+    assert view.readout_s == pytest.approx(-0.0255, abs=1e-9)
+
+
+def test_an_unknown_readout_stays_unknown() -> None:
+    assert readout_from_message(readout_to_message(None, HEAD)) is None
+    assert readout_from_message(TimeReference(header=HEAD)) is None
 
 
 def test_an_empty_model_image_means_no_model() -> None:
