@@ -18,8 +18,9 @@ pytestmark = [pytest.mark.ros, pytest.mark.slow]
 from geometry_msgs.msg import PoseStamped  # noqa: E402
 from graph_processes import Graph, Running  # noqa: E402
 from rclpy.node import Node  # noqa: E402
+from rclpy.subscription import Subscription  # noqa: E402
 from sensor_msgs.msg import CameraInfo, Image  # noqa: E402
-from std_srvs.srv import Trigger  # noqa: E402
+from std_srvs.srv import SetBool, Trigger  # noqa: E402
 
 from bdgs_ros.bridge import conversions, topics  # noqa: E402
 from bdgs_ros.core.config import BdgsConfig, with_values  # noqa: E402
@@ -84,6 +85,15 @@ def localised(
     )
 
 
+def wait_until_connected(readers: list[Subscription]) -> None:
+    """What is published before its reader is known is lost, and ten frames are over at once."""
+    deadline = time.monotonic() + 30
+    while not all(reader.get_publisher_count() for reader in readers):
+        assert time.monotonic() < deadline, 'nobody publishes what is rendered'
+        time.sleep(0.1)
+    time.sleep(1.0)  # for the other direction
+
+
 def test_localising_in_a_saved_map(
     graph: Graph,
     ros: Callable,
@@ -98,10 +108,11 @@ def test_localising_in_a_saved_map(
     assert files_of(map_file) == before
     assert len(expected) == len(BagSequence(bag)) - HALF
     shown: dict[str, dict[int, Image]] = {}
+    readers = []
     with ros() as me:
         for topic in (topics.RENDERED_IMAGE, topics.RENDERED_DEPTH, topics.DYNAMIC_PROBABILITY):
             found = shown.setdefault(topic, {})
-            me.create_subscription(
+            reader = me.create_subscription(
                 Image,
                 topic,
                 lambda message, found=found: found.update(
@@ -109,12 +120,17 @@ def test_localising_in_a_saved_map(
                 ),
                 topics.RELIABLE,
             )
+            readers.append(reader)
         out = tmp_path / 'out'
         slam = graph.node(
             'slam_node', bag=bag, output=out, exit_at_end=True, mode='lockstep',
             map_file=map_file, localization=True, start=seconds_in(bag, HALF),
-            start_pose=f'"{as_text(start, tmp_path)}"', **settings,
+            start_pose=f'"{as_text(start, tmp_path)}"', paused=True, **settings,
         )  # fmt: skip
+        wait_until_connected(readers)
+        play = me.create_client(SetBool, 'bdgs/replay/pause')
+        assert play.wait_for_service(20.0)
+        play.call_async(SetBool.Request(data=False))
         assert slam.wait(120.0) == 0, slam.text()
     live = read_trajectory(out / 'trajectory.txt')
     assert live.stamps_ns.tolist() == expected.stamps_ns.tolist()
