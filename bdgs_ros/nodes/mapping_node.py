@@ -88,8 +88,8 @@ class MappingNode(GraphNode):
             nice=config.mapping_nice,
         )
         self._subscribe()
-        self._serve()
         self._load_at_start()
+        self._serve()
         self.get_logger().info(f'mapping is ready: mode {config.mode}')
 
     def _subscribe(self) -> None:
