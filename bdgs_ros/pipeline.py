@@ -103,6 +103,7 @@ class BdgsSlam:
         if tracking.is_keyframe:
             keyframe = Keyframe(frame, tracking.T_world_camera, labels.p_dynamic)
             self.tracker.set_model(take_keyframe(self.back_end, self.mapper, keyframe))
+            self.tracker.note_keyframes(self.mapper.keyframe_poses())
         return FrameResult(labels, tracking)
 
     def reset(self) -> None:

@@ -11,12 +11,14 @@ camera; topics have `map` with x forward, y left, z up (REP 103), as a level fir
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, PoseStamped, Quaternion
 from geometry_msgs.msg import Pose as PoseMsg
+from nav_msgs.msg import Path
 from numpy.typing import NDArray
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
@@ -24,7 +26,7 @@ from std_msgs.msg import Header
 from bdgs_ros.bridge.cdr_image import CdrImage
 from bdgs_ros.core import se3
 from bdgs_ros.core.errors import DatasetError
-from bdgs_ros.core.types import ColorImage, DepthImage, Pose, ProbabilityImage
+from bdgs_ros.core.types import ColorImage, DepthImage, Pose, ProbabilityImage, StampedPose
 from bdgs_ros.data.messages import (
     camera_from_message,
     color_from_message,
@@ -137,6 +139,18 @@ def pose_from_message(pose: PoseMsg) -> Pose:
 def pose_stamped(T_world_camera: Pose, at_ns: int, map_frame: str) -> PoseStamped:
     """Stamp a camera pose."""
     return PoseStamped(header=header(at_ns, map_frame), pose=pose_to_message(T_world_camera))
+
+
+def path_message(poses: Iterable[StampedPose], at_ns: int, map_frame: str) -> Path:
+    """Join stamped camera poses to a path."""
+    path = Path(header=header(at_ns, map_frame))
+    path.poses = [pose_stamped(p.T_world_camera, p.stamp_ns, map_frame) for p in poses]
+    return path
+
+
+def poses_from_path(message: Path) -> dict[int, Pose]:
+    """Return `T_world_camera` by stamp (ns)."""
+    return {stamp_ns(pose): pose_from_message(pose.pose) for pose in message.poses}
 
 
 def pose_covariance_to_message(

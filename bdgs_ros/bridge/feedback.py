@@ -7,6 +7,7 @@ import time
 from collections import OrderedDict
 from typing import TypeVar
 
+from nav_msgs.msg import Path
 from rclpy.node import Node
 from sensor_msgs.msg import Image
 from std_msgs.msg import Bool, Empty
@@ -19,7 +20,7 @@ from bdgs_ros.bridge.node_config import TrackingNodeConfig
 from bdgs_ros.bridge.stamped import StampBuffer
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.errors import DatasetError
-from bdgs_ros.core.types import NO_KEYFRAME_NS, Labels, ModelView, RgbdFrame, TrackingResult
+from bdgs_ros.core.types import NO_KEYFRAME_NS, Labels, ModelView, Pose, RgbdFrame, TrackingResult
 from bdgs_ros.data.trajectory_io import seconds_to_ns
 
 Item = TypeVar('Item')
@@ -63,6 +64,8 @@ class Feedback:
         self._request = node.create_publisher(Empty, topics.MAP_REQUEST, topics.RELIABLE)
         node.create_subscription(Bool, topics.LOCALIZATION, self._on_localization, topics.LATCHED)
         node.create_subscription(Image, topics.LABELS, self._keep_labels, topics.KEPT, raw=True)
+        self._moved: dict[int, Pose] = {}
+        node.create_subscription(Path, topics.KEYFRAMES, self._on_keyframes, topics.LATCHED)
         self._subscription = ModelSubscription(
             node, lambda stamp_ns, found: self._models.put(stamp_ns, (stamp_ns, found))
         )
@@ -70,6 +73,14 @@ class Feedback:
     def _keep_labels(self, message: bytes) -> None:
         image = image_from_cdr(message)
         self._labels.put(conversions.stamp_ns(image), image)
+
+    def _on_keyframes(self, message: Path) -> None:
+        self._moved = conversions.poses_from_path(message)
+
+    def moved_keyframes(self) -> dict[int, Pose]:
+        """Return where mapping has the keyframes, if it has said so since the last call."""
+        moved, self._moved = self._moved, {}
+        return moved
 
     def _on_localization(self, message: Bool) -> None:
         self._map_is_frozen = message.data
@@ -178,4 +189,5 @@ class Feedback:
         """Forget the models; labels of another time are not found by their stamps anyway."""
         self._models.clear()
         self._keyframes.clear()
+        self._moved = {}
         self._asked_s = -math.inf

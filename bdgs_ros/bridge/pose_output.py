@@ -91,9 +91,5 @@ class PoseOutput:
         self._path_sent_s = now
         stride = max(1, len(self._poses) // _PATH_POSES)
         chosen = self._poses[::stride]
-        path = Path(header=conversions.header(chosen[-1].stamp_ns, self._config.map_frame))
-        path.poses = [
-            conversions.pose_stamped(p.T_world_camera, p.stamp_ns, self._config.map_frame)
-            for p in chosen
-        ]
-        self._path.publish(path)
+        frame = self._config.map_frame
+        self._path.publish(conversions.path_message(chosen, chosen[-1].stamp_ns, frame))

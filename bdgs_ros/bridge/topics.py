@@ -15,6 +15,7 @@ DETECTIONS = 'bdgs/detections'
 POSE = 'bdgs/pose'
 ODOMETRY = 'bdgs/odometry'
 PATH = 'bdgs/path'
+KEYFRAMES = 'bdgs/keyframes'
 STATUS = 'bdgs/status'
 """One message per image that tracking took: the acknowledgement that lockstep waits for."""
 KEYFRAME = 'bdgs/keyframe'

@@ -14,6 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Path as PathMessage
 from sensor_msgs.msg import Image
 from std_msgs.msg import Bool, Empty
 
@@ -107,6 +108,7 @@ class MappingNode(GraphNode):
         self.create_subscription(
             Empty, topics.MAP_REQUEST, lambda _: self._on_request(), topics.RELIABLE
         )
+        self._keyframes = self.create_publisher(PathMessage, topics.KEYFRAMES, topics.LATCHED)
         self._localization = self.create_publisher(Bool, topics.LOCALIZATION, topics.LATCHED)
 
     def _serve(self) -> None:
@@ -181,6 +183,7 @@ class MappingNode(GraphNode):
             self._health.error(error)
         finally:  # an empty answer tells tracking not to wait
             self._models.publish(stamp_ns, view)
+        self._publish_keyframes(stamp_ns)
         self._health.counts['gaussians'] = len(self._mapper.map)
         self._health.counts['keyframes_dropped'] = self._worker.dropped
 
@@ -191,6 +194,12 @@ class MappingNode(GraphNode):
             self._version += not self._mapper.frozen
         self._health.counts['keyframes'] += 1
         return view
+
+    def _publish_keyframes(self, stamp_ns: int) -> None:
+        """Say where the keyframes are now: a closed loop moves those of long ago."""
+        poses = [StampedPose(*item) for item in sorted(self._mapper.keyframe_poses().items())]
+        frame = self._config.map_frame
+        self._keyframes.publish(conversions.path_message(poses, stamp_ns, frame))
 
     def _observe_until(self, stamp_ns: int) -> None:
         """Give the back end the poses of frames up to a keyframe; it knows that one itself."""

@@ -86,6 +86,7 @@ class TrackingNode(GraphNode):
         labels = self._feedback.labels(frame)
         for view in self._feedback.new_models():
             self._tracker.set_model(view)
+        self._tracker.note_keyframes(self._feedback.moved_keyframes())
         started = time.perf_counter()
         result = self._tracker.process(frame, labels)
         tracking_ms = (time.perf_counter() - started) * 1e3

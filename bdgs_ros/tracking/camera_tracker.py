@@ -40,10 +40,7 @@ from bdgs_ros.tracking.starts import (
     Hypothesis,
     Reference,
     Start,
-    Transform,
     information_of,
-    latest_of,
-    moved,
 )
 
 _log = logging.getLogger(__name__)
@@ -128,39 +125,36 @@ class CameraTracker:
         if tracked is None:
             return
         T_new_old = se3.orthonormalise(view.T_world_camera @ se3.inverse(tracked))
-        self._tracked = {s: pose for s, pose in self._tracked.items() if s >= view.stamp_ns}
-        self._move(lambda stamp_ns: T_new_old if stamp_ns in self._tracked else None)
+        self._tracked = {
+            stamp_ns: se3.orthonormalise(T_new_old @ pose)
+            for stamp_ns, pose in self._tracked.items()
+            if stamp_ns >= view.stamp_ns
+        }
+        self._places.put(self._tracked)
+        self._move_present(self._tracked)
 
-    def correct_poses(self, transforms: Mapping[int, Pose]) -> None:
+    def note_keyframes(self, poses: Mapping[int, Pose]) -> None:
         """
-        Follow a correction of the trajectory, such as a closed loop.
+        Take where mapping has the keyframes now: places are where they were seen.
 
         Parameters
         ----------
-        transforms : mapping of int to ndarray, shape (4, 4)
-            `T_new_old` in world by the stamp of a keyframe (ns). Keyframes that are not named
-            move with the last one before them that is.
+        poses : mapping of int to ndarray, shape (4, 4)
+            `T_world_camera` by stamp (ns). Keyframes whose view is still to come move with that.
 
         """
-        transform = latest_of(transforms)
-        self._move(transform)
-        if self._model is not None:
-            self._model = moved(self._model, transform)
+        settled = {stamp_ns: T for stamp_ns, T in poses.items() if stamp_ns not in self._tracked}
+        self._places.put(settled)
+        self._move_present(settled)
 
-    def _move(self, transform: Transform) -> None:
-        """Move all that is known of keyframes, and the present with the last of them."""
-        self._hypothesis = None
-        self._places.move(transform)
-        for stamp_ns, pose in self._tracked.items():
-            T_new_old = transform(stamp_ns)
-            if T_new_old is not None:
-                self._tracked[stamp_ns] = se3.orthonormalise(T_new_old @ pose)
-        if self._keyframe is None:
+    def _move_present(self, poses: Mapping[int, Pose]) -> None:
+        """Move the present with the keyframe that it is relative to."""
+        if self._keyframe is None or self._keyframe.stamp_ns not in poses:
             return
-        T_new_old = transform(self._keyframe.stamp_ns)
-        if T_new_old is not None:
-            self._motion.move(T_new_old)
-            self._keyframe = moved(self._keyframe, transform)
+        self._hypothesis = None
+        new = poses[self._keyframe.stamp_ns]
+        self._motion.move(se3.orthonormalise(new @ se3.inverse(self._keyframe.T_world_camera)))
+        self._keyframe = replace(self._keyframe, T_world_camera=new)
 
     def process(self, frame: RgbdFrame, labels: Labels | None = None) -> TrackingResult:
         """

@@ -9,7 +9,7 @@ The likeliest places are matched feature by feature, and PnP with RANSAC says wh
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import cv2
@@ -22,7 +22,6 @@ from bdgs_ros.core.config.tracking import FeatureConfig, PlacesConfig
 from bdgs_ros.core.types import Pose, ProbabilityImage, RgbdFrame
 from bdgs_ros.tracking.features import FeatureExtractor, Features, match
 from bdgs_ros.tracking.pnp import locate
-from bdgs_ros.tracking.starts import Transform
 
 _TABLES, _BITS = 8, 12  # of the hash: words per feature, and bits of each
 _METRES_PER_RADIAN = 2.0  # a turn moves the view as far as this at usual depths
@@ -103,21 +102,11 @@ class Places:
         if len(self._places) > self._config.count:
             del self._places[_most_redundant(self._places)]
 
-    def move(self, transform: Transform) -> None:
-        """
-        Follow a correction of the world.
-
-        Parameters
-        ----------
-        transform : callable
-            Gives `T_new_old` in world of the keyframe with a stamp (ns), None where it stays.
-
-        """
+    def put(self, poses: Mapping[int, Pose]) -> None:
+        """Take new poses, `T_world_camera` by stamp (ns); what is not named stays."""
         for i, place in enumerate(self._places):
-            T_new_old = transform(place.stamp_ns)
-            if T_new_old is not None:
-                moved = se3.orthonormalise(T_new_old @ place.T_world_camera)
-                self._places[i] = replace(place, T_world_camera=moved)
+            if place.stamp_ns in poses:
+                self._places[i] = replace(place, T_world_camera=poses[place.stamp_ns])
 
     def prepare(self, most: int = 1) -> None:
         """Extract the features of so many places that have none yet."""

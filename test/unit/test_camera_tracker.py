@@ -247,20 +247,46 @@ def test_a_correction_moves_everything_that_is_known(recording: tuple) -> None:
     for frame in frames[:4]:
         corrected.process(frame)
         plain.process(frame)
-    T_new_old = se3.exp(np.array([0.5, -0.2, 0.1, 0.1, 0.2, -0.1]))
-    corrected.correct_poses({frames[0].stamp_ns: T_new_old})
+    new = se3.exp(np.array([0.5, -0.2, 0.1, 0.1, 0.2, -0.1]))  # the first was at the origin
+    still = np.zeros(CAMERA.shape, np.uint8)
+    view = ModelView(frames[0].stamp_ns, new, CAMERA, frames[0].color, frames[0].depth_m, still)
+    same = replace(view, T_world_camera=np.eye(4))
+    corrected.set_model(view)
+    plain.set_model(same)
     one, other = corrected.process(frames[4]), plain.process(frames[4])
-    expected = T_new_old @ other.T_world_camera
+    expected = new @ other.T_world_camera
     np.testing.assert_allclose(one.T_world_camera, expected, atol=1e-6)
 
 
-def test_a_correction_of_later_keyframes_leaves_the_present(recording: tuple) -> None:
+def test_keyframes_whose_view_is_to_come_are_not_moved_twice(recording: tuple) -> None:
     frames, _ = recording
     tracker = CameraTracker(CONFIG)
     before = tracker.process(frames[0])
-    tracker.correct_poses({frames[9].stamp_ns: se3.exp(np.ones(6))})
+    tracker.note_keyframes({frames[n].stamp_ns: se3.exp(np.ones(6)) for n in (0, 9)})
     after = tracker.process(frames[1])
     assert np.linalg.norm(after.T_world_camera[:3, 3] - before.T_world_camera[:3, 3]) < 0.05
+
+
+def test_places_go_where_mapping_has_their_keyframes(recording: tuple) -> None:
+    """A loop is closed: what the camera will be recognised at has moved."""
+    frames, _ = recording
+    tracker = CameraTracker(CONFIG)
+    tracker.start_from(
+        ModelView(
+            0,
+            np.eye(4),
+            CAMERA,
+            frames[0].color,
+            frames[0].depth_m,
+            np.zeros(CAMERA.shape, np.uint8),
+        ),
+        [Keyframe(frames[n], np.eye(4), np.zeros(CAMERA.shape, np.uint8)) for n in (0, 5)],
+    )
+    new = se3.exp(np.array([0.5, -0.2, 0.1, 0.1, 0.2, -0.1]))
+    tracker.note_keyframes({frames[5].stamp_ns: new})
+    first, second = (place.T_world_camera for place in tracker._places)
+    assert np.array_equal(first, np.eye(4))
+    assert np.array_equal(second, new)
 
 
 def test_while_lost_no_pose_is_made_up(recording: tuple) -> None:

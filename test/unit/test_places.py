@@ -58,7 +58,7 @@ def test_what_moves_is_no_landmark(places: Places) -> None:
 
 
 def test_places_move_with_the_world(places: Places) -> None:
-    places.move(lambda stamp_ns: pose(1.0) if stamp_ns >= 7 else None)
+    places.put({7: pose(71.0), 99: pose(5.0)})
     assert places.find(wall(7), STILL)[0].T_world_camera[0, 3] == pytest.approx(71.0, abs=0.02)
     assert places.find(wall(3), STILL)[0].T_world_camera[0, 3] == pytest.approx(30.0, abs=0.02)
 
