@@ -51,8 +51,8 @@ SAVE_FINAL_TRAJECTORY = 'bdgs/save_final_trajectory'
 REPLAY_PAUSE = 'bdgs/replay/pause'
 REPLAY_STEP = 'bdgs/replay/step'
 
-RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
-"""Small messages: every one counts, late ones still do."""
+RELIABLE = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
+"""Small messages: every one counts, also after a stall of three seconds."""
 KEPT = QoSProfile(
     depth=10,
     reliability=ReliabilityPolicy.RELIABLE,
