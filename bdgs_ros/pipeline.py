@@ -128,7 +128,7 @@ def take_keyframe(back_end: BackEnd, mapper: Mapper, keyframe: Keyframe) -> Mode
     stamp_ns, tracked = keyframe.frame.stamp_ns, keyframe.T_world_camera
     transforms = back_end.process(keyframe, mapper.keyframe_poses())
     mapper.correct_poses(transforms)
-    mapper.readout_s = back_end.calibration.readout_s
+    mapper.readout_s = back_end.readout_s
     corrected = transforms[stamp_ns] @ tracked if transforms else tracked
     frame, p_dynamic = straightened(keyframe.frame, keyframe.p_dynamic, back_end.sweep(stamp_ns))
     return mapper.process(Keyframe(frame, corrected, p_dynamic), tracked)

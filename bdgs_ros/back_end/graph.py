@@ -47,6 +47,8 @@ class Solution:
     poses: list[Pose]
     """T_world_camera in the order given; the first one is where it was."""
     calibration: Calibration
+    readout_sigma_s: float
+    """How well the readout is known, if the pairs are independent of each other."""
 
 
 def solve(
@@ -97,7 +99,9 @@ def solve(
         if wide == 1.0 and np.abs(step).max() < _SETTLED:
             break
     return Solution(
-        [se3.orthonormalise(T) for T in world], Calibration.of_vector(np.asarray(vector))
+        [se3.orthonormalise(T) for T in world],
+        Calibration.of_vector(np.asarray(vector)),
+        system.last_sigma(),
     )
 
 
@@ -214,14 +218,23 @@ class _System:
 
     def solve(self) -> Array:
         """Return the step of all unknowns, [6 N + 6]."""
+        right = np.concatenate([self._right.ravel(), self._right_common])
+        return np.asarray(-cho_solve(self._factor(), right))
+
+    def last_sigma(self) -> float:
+        """Return the standard deviation of the last unknown."""
+        unit = np.zeros(6 * self._count + SIZE)
+        unit[-1] = 1
+        return float(np.sqrt(cho_solve(self._factor(), unit)[-1]))
+
+    def _factor(self) -> tuple[Array, bool]:
         size = 6 * self._count
         matrix = np.empty((size + SIZE, size + SIZE))
         matrix[:size, :size] = self._blocks.transpose(0, 2, 1, 3).reshape(size, size)
         matrix[:size, size:] = self._mixed.reshape(size, SIZE)
         matrix[size:, :size] = matrix[:size, size:].T
         matrix[size:, size:] = self._common
-        right = np.concatenate([self._right.ravel(), self._right_common])
-        return np.asarray(-cho_solve(cho_factor(matrix), right))
+        return cho_factor(matrix)
 
 
 def _inverses(T: Array) -> Array:
