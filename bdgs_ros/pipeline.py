@@ -88,6 +88,7 @@ class BdgsSlam:
         start = se3.identity() if T_world_camera is None else T_world_camera
         self.reset()
         self.mapper.load(map_file)
+        self.back_end.start_from(self.mapper.readout_s)
         self.mapper.history.begin_run()
         self.mapper.frozen = localise
         view = entrance(self.mapper, start, camera.rectified(), self._map_width)

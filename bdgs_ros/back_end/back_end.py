@@ -11,14 +11,15 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bdgs_ros.back_end.calibration import Calibration
+from bdgs_ros.back_end.calibration import Calibration, Known
 from bdgs_ros.back_end.corners import Corners, Shared, View, find_corners, follow, overlap
 from bdgs_ros.back_end.graph import Edge, solve
-from bdgs_ros.back_end.loop import LoopDetector
+from bdgs_ros.back_end.loop import LoopDetector, Recognised, agree
 from bdgs_ros.back_end.pair import PairFactor, condense
 from bdgs_ros.back_end.velocity import velocity_at
 from bdgs_ros.core import se3
@@ -32,6 +33,7 @@ _RENEWED = 12  # pairs condensed again at a keyframe, at most
 _OFF_RAD = 0.002  # how far the images of a pair may be bent otherwise than it was condensed with
 _OVERCONFIDENT = 3.0  # pairs share velocities, so their errors are not independent
 _LEAST_SIGMA_S = 0.001
+_SAVED_SIGMA_S = 0.002  # of a readout that a map was saved with
 _NEAR_M, _NEAR_RAD = 2.0, 0.8  # keyframes further apart are not asked what they share
 _FEW_INLIERS = 0.5  # of the followed corners, for a recognised place to be believed
 _METRES_PER_RADIAN = 2.0  # a turn moves the view as far as this at usual depths
@@ -58,12 +60,14 @@ class BackEnd:
 
     def __init__(self, config: BackEndConfig) -> None:
         self._config = config
+        self._known = Known(Calibration.perfect(), config.bundle.readout_sigma_s)
+        self.calibration = self._known.calibration
+        self._readout_sigma_s = self._known.readout_sigma_s
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything."""
-        self.calibration = Calibration.perfect()
-        self._readout_sigma_s = self._config.bundle.readout_sigma_s
+        """Forget all keyframes. The camera is the same: its calibration stays."""
+        self._known = Known(self.calibration, self._readout_sigma_s)
         self.loops = 0
         """How many recognised places were joined."""
         self._recent: deque[tuple[int, Pose]] = deque(maxlen=_RECENT)
@@ -72,6 +76,14 @@ class BackEnd:
         self._pairs: dict[tuple[int, int], _Pair] = {}
         self._follows: dict[int, int] = {}  # keyframes that were dropped: whom they move with
         self._loop = LoopDetector(self._config.loop)
+        self._suspected: Recognised | None = None  # by the last keyframe, and not yet believed
+
+    def start_from(self, readout_s: float | None) -> None:
+        """Begin with what a saved map knows of the shutter; None or 0 where it knows nothing."""
+        if readout_s:
+            self.calibration = replace(self.calibration, readout_s=readout_s)
+            self._readout_sigma_s = _SAVED_SIGMA_S
+        self.reset()
 
     def observe(self, stamp_ns: int, T_world_camera: Pose) -> None:
         """Take the pose of every tracked frame, in order of time: they tell velocities."""
@@ -117,7 +129,7 @@ class BackEnd:
     @property
     def readout_s(self) -> float:
         """
-        The readout time as far as it is known: 0 where it might as well be, and then less shrunk.
+        The readout time as far as it is known: 0 while it might as well be.
 
         It is the positive-part estimator of James and Stein (1961) for a single number.
         """
@@ -187,8 +199,17 @@ class BackEnd:
         window = list(self._views)[-self._config.bundle.window - 1 :]
         among = [known for known in self._views if known not in joined and known not in window]
         found = self._loop.find(stamp_ns, among) if among else None
-        if found is not None and self._join(corners, found.stamp_ns, found.T_earlier_new):
+        if self._is_believed(found) and self._join(corners, found.stamp_ns, found.T_earlier_new):
             self.loops += 1
+        self._suspected = found
+
+    def _is_believed(self, found: Recognised | None) -> TypeGuard[Recognised]:
+        """Return whether a place is sure, or the keyframe before says the same."""
+        if found is None:
+            return False
+        if found.inliers >= self._config.loop.sure_inliers:
+            return True
+        return self._suspected is not None and agree(self._suspected, found, self._poses)
 
     def _renew(self) -> None:
         """Condense again the pairs whose velocities or readout have become the most wrong."""
@@ -201,7 +222,7 @@ class BackEnd:
                 pair.factor = self._condense(pair.shared, one, other, start)
 
     def _off_rad(self, key: tuple[int, int]) -> float:
-        """Return by how much the images of a pair are bent otherwise than it was condensed with."""
+        """Return how far the images of a pair are bent otherwise than it was condensed with."""
         factor = self._pairs[key].factor
         readout_s = abs(self.calibration.readout_s) + self._readout_sigma_s
         wrong_s = abs(factor.held_readout_s - self.calibration.readout_s)
@@ -222,7 +243,7 @@ class BackEnd:
         if not edges:
             return {}
         before = [self._poses[stamp_ns] for stamp_ns in stamps]
-        solution = solve(before, edges, self.calibration, self._config.bundle)
+        solution = solve(before, edges, self.calibration, self._known, self._config.bundle)
         self.calibration = solution.calibration
         self._readout_sigma_s = max(_OVERCONFIDENT * solution.readout_sigma_s, _LEAST_SIGMA_S)
         moved = {

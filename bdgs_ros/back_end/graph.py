@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
-from bdgs_ros.back_end.calibration import BENDS, SIZE, Calibration
+from bdgs_ros.back_end.calibration import BENDS, SIZE, Calibration, Known
 from bdgs_ros.back_end.pair import PairFactor
 from bdgs_ros.core import se3
 from bdgs_ros.core.config.back_end import BundleConfig
@@ -55,6 +55,7 @@ def solve(
     poses: Sequence[Pose],
     edges: Sequence[Edge],
     calibration: Calibration,
+    known: Known,
     config: BundleConfig,
 ) -> Solution:
     """
@@ -71,8 +72,10 @@ def solve(
         2020), so that a true loop far from the present poses can pull them.
     calibration : Calibration
         Start.
+    known : Known
+        Of the calibration, beforehand.
     config : BundleConfig
-        What is known beforehand.
+        Noise.
 
     """
     world = np.array(poses)
@@ -81,7 +84,7 @@ def solve(
     chain = _neighbours(world)
     sigma = np.repeat([config.odometry_m, config.odometry_rad], 3)
     chain_information = np.broadcast_to(np.diag(sigma**-2), (len(chain.one), 6, 6))
-    known = np.append(np.full(BENDS, config.bend_sigma), config.readout_sigma_s) ** -2
+    sure = np.append(np.full(BENDS, config.bend_sigma), known.readout_sigma_s) ** -2
     wide = np.inf
     for _ in range(_ROUNDS):
         system = _System(len(world))
@@ -91,7 +94,7 @@ def solve(
         system.add(world, pairs, xi, vector, 1 / (1 + error / wide) ** 2)
         drift = _apart(world, chain)
         system.add_motion(world, chain, chain_information, drift)
-        system.add_known(known, vector)
+        system.add_known(sure, vector - known.calibration.vector)
         step = system.solve()
         moves = step[: 6 * len(world)].reshape(-1, 6)
         world = np.array([se3.exp(move) @ T for move, T in zip(moves, world, strict=True)])
@@ -197,7 +200,7 @@ class _System:
         self._add_blocks(pairs, adjoint, information, pull)
 
     def add_known(self, information: Array, vector: Array) -> None:
-        """Add what is known of the calibration; hold the first pose."""
+        """Add how far the calibration is from what is known of it; hold the first pose."""
         self._common += np.diag(information)
         self._right_common += information * vector
         self._blocks[0, 0] += _FIXED * np.eye(6)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +42,7 @@ def velocity_at(stamp_ns: int, tracked: Sequence[tuple[int, Pose]]) -> Array:
     at = np.searchsorted([entry[0] for entry in entries], stamp_ns)
     near = entries[max(at - _AROUND, 0) : at + _AROUND + 1]
     times, velocities = [], []
-    for (before_ns, T_before), (after_ns, T_after) in zip(near[:-1], near[1:], strict=True):
+    for (before_ns, T_before), (after_ns, T_after) in pairwise(near):
         step_s = (after_ns - before_ns) * 1e-9
         if before_ns != stamp_ns and step_s <= _LONGEST_STEP_S:
             times.append(((before_ns + after_ns) / 2 - stamp_ns) * 1e-9)

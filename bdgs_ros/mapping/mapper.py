@@ -31,7 +31,7 @@ from bdgs_ros.mapping.gaussians import GaussianMap
 from bdgs_ros.mapping.history import History
 from bdgs_ros.mapping.inference import Inference
 from bdgs_ros.mapping.keyframe_store import KeyframeSet
-from bdgs_ros.mapping.keyframes import (
+from bdgs_ros.mapping.keyframes import , photograph(
     Level,
     MapKeyframe,
     build_levels,
@@ -389,11 +389,7 @@ class Mapper:
 
     def photographs(self) -> Iterator[Keyframe]:
         """Yield the keyframes of the map at its size: places that may be recognised."""
-        for known in self.keyframes:
-            level = known.levels[0]
-            frame = RgbdFrame(known.stamp_ns, level.image, level.depth_m, level.camera)
-            moving = np.where(level.static, known.p_dynamic, np.uint8(255))
-            yield Keyframe(frame, known.T_world_camera, moving)
+        return map(photograph, self.keyframes)
 
     def save(self, path: Path, *, keyframes: bool = True) -> None:
         """
