@@ -31,12 +31,13 @@ from bdgs_ros.mapping.gaussians import GaussianMap
 from bdgs_ros.mapping.history import History
 from bdgs_ros.mapping.inference import Inference
 from bdgs_ros.mapping.keyframe_store import KeyframeSet
-from bdgs_ros.mapping.keyframes import , photograph(
+from bdgs_ros.mapping.keyframes import (
     Level,
     MapKeyframe,
     build_levels,
     is_dynamic,
     most_redundant,
+    photograph,
     shrink,
 )
 from bdgs_ros.mapping.lift import lift
