@@ -245,7 +245,8 @@ class BackEnd:
         before = [self._poses[stamp_ns] for stamp_ns in stamps]
         solution = solve(before, edges, self.calibration, self._known, self._config.bundle)
         self.calibration = solution.calibration
-        self._readout_sigma_s = max(_OVERCONFIDENT * solution.readout_sigma_s, _LEAST_SIGMA_S)
+        sigma_s = max(_OVERCONFIDENT * solution.readout_sigma_s, _LEAST_SIGMA_S)
+        self._readout_sigma_s = min(sigma_s, self._known.readout_sigma_s)
         moved = {
             stamp_ns: new @ se3.inverse(old)
             for stamp_ns, new, old in zip(stamps, solution.poses, before, strict=True)

@@ -237,7 +237,8 @@ class _System:
         matrix[:size, size:] = self._mixed.reshape(size, SIZE)
         matrix[size:, :size] = matrix[:size, size:].T
         matrix[size:, size:] = self._common
-        return cho_factor(matrix)
+        triangle, is_lower = cho_factor(matrix)
+        return np.asarray(triangle), bool(is_lower)
 
 
 def _inverses(T: Array) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Sequence
 from itertools import pairwise
 
@@ -39,7 +40,7 @@ def velocity_at(stamp_ns: int, tracked: Sequence[tuple[int, Pose]]) -> Array:
 
     """
     entries = list(tracked)
-    at = np.searchsorted([entry[0] for entry in entries], stamp_ns)
+    at = bisect_left([entry[0] for entry in entries], stamp_ns)
     near = entries[max(at - _AROUND, 0) : at + _AROUND + 1]
     times, velocities = [], []
     for (before_ns, T_before), (after_ns, T_after) in pairwise(near):

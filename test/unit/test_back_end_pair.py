@@ -186,6 +186,28 @@ def test_a_rolling_shutter_is_found_and_taken_out(readout_s: float) -> None:
         assert worst_m(without.poses, truth) > 2 * worst_m(solution.poses, truth)
 
 
+def test_a_pair_that_turned_back_tells_the_readout_at_once() -> None:
+    room = Room.random(Calibration(np.zeros(5), 0.025))
+    truth = motions(2)[1]
+    turning = np.array([0, 0, 0, 0, 1.8, 0])
+    shared = room.share(truth, se3.identity(), (turning, -turning))
+    known = Calibration.perfect(), SIGMA_S, FOCAL, CONFIG
+    factor = condense(shared, truth, (turning, -turning), *known)
+    assert factor.calibration.readout_s == pytest.approx(0.025, abs=0.001)
+    assert factor.inliers > 55
+    held = condense(shared, truth, (turning, -turning), Calibration.perfect(), 1e-6, *known[2:])
+    assert held.inliers < 45
+
+
+def test_what_is_known_of_the_shutter_is_kept_where_nothing_moves() -> None:
+    room = Room.random(Calibration.perfect())
+    truth = motions(4)
+    known = Known(Calibration(np.zeros(5), 0.02), 0.002)
+    solution = solve(truth, edges(room, truth, [STILL] * 4), known.calibration, known, CONFIG)
+    assert solution.calibration.readout_s == pytest.approx(0.02, abs=1e-4)
+    assert solution.readout_sigma_s == pytest.approx(0.002, rel=0.01)
+
+
 def test_a_pair_that_all_others_contradict_is_overruled() -> None:
     room = Room.random(Calibration.perfect())
     truth = motions(8)
