@@ -45,7 +45,7 @@ class LoopConfig:
     """Places seen before, recognised without knowing where the camera is."""
 
     enabled: bool = param(True, 'look for places seen before')
-    candidates: int = param(4, 'likeliest keyframes compared with a new one', low=1, high=1000)
+    candidates: int = param(3, 'likeliest keyframes compared with a new one', low=1, high=1000)
     min_inliers: int = param(25, 'matches that agree on one pose', low=6, high=1000)
     sure_inliers: int = param(
         60, 'so many are believed though the keyframe before saw no such place', low=6, high=1000
