@@ -88,6 +88,7 @@ class BdgsSlam:
         start = se3.identity() if T_world_camera is None else T_world_camera
         self.reset()
         self.mapper.load(map_file)
+        self.back_end.start_from(self.mapper.readout_s)
         self.mapper.history.begin_run()
         self.mapper.frozen = localise
         view = entrance(self.mapper, start, camera.rectified(), self._map_width)
@@ -129,7 +130,7 @@ def take_keyframe(back_end: BackEnd, mapper: Mapper, keyframe: Keyframe) -> Mode
     stamp_ns, tracked = keyframe.frame.stamp_ns, keyframe.T_world_camera
     transforms = back_end.process(keyframe, mapper.keyframe_poses())
     mapper.correct_poses(transforms)
-    mapper.readout_s = back_end.calibration.readout_s
+    mapper.readout_s = back_end.readout_s
     corrected = transforms[stamp_ns] @ tracked if transforms else tracked
     frame, p_dynamic = straightened(keyframe.frame, keyframe.p_dynamic, back_end.sweep(stamp_ns))
     return mapper.process(Keyframe(frame, corrected, p_dynamic), tracked)

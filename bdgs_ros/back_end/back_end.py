@@ -10,16 +10,18 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bdgs_ros.back_end.calibration import Calibration
+from bdgs_ros.back_end.calibration import Calibration, Known
 from bdgs_ros.back_end.corners import Corners, Shared, View, find_corners, follow, overlap
 from bdgs_ros.back_end.graph import Edge, solve
-from bdgs_ros.back_end.loop import LoopDetector
+from bdgs_ros.back_end.loop import LoopDetector, Recognised, agree
 from bdgs_ros.back_end.pair import PairFactor, condense
+from bdgs_ros.back_end.velocity import velocity_at
 from bdgs_ros.core import se3
 from bdgs_ros.core.config.back_end import BackEndConfig
 from bdgs_ros.core.types import Keyframe, Pose
@@ -27,9 +29,11 @@ from bdgs_ros.core.types import Keyframe, Pose
 Array = NDArray[np.float64]
 
 _RECENT = 300  # poses of frames: keyframes may come late
-_LONGEST_STEP_S = 0.2  # between two frames that tell a velocity
-_RENEWED = 6  # pairs condensed again at a keyframe, at most
-_READOUT_OFF_S = 0.002  # from the calibration that a pair was condensed with
+_RENEWED = 12  # pairs condensed again at a keyframe, at most
+_OFF_RAD = 0.002  # how far the images of a pair may be bent otherwise than it was condensed with
+_OVERCONFIDENT = 3.0  # pairs share velocities, so their errors are not independent
+_LEAST_SIGMA_S = 0.001
+_SAVED_SIGMA_S = 0.002  # of a readout that a map was saved with
 _NEAR_M, _NEAR_RAD = 2.0, 0.8  # keyframes further apart are not asked what they share
 _FEW_INLIERS = 0.5  # of the followed corners, for a recognised place to be believed
 _METRES_PER_RADIAN = 2.0  # a turn moves the view as far as this at usual depths
@@ -56,11 +60,14 @@ class BackEnd:
 
     def __init__(self, config: BackEndConfig) -> None:
         self._config = config
+        self._known = Known(Calibration.perfect(), config.bundle.readout_sigma_s)
+        self.calibration = self._known.calibration
+        self._readout_sigma_s = self._known.readout_sigma_s
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything."""
-        self.calibration = Calibration.perfect()
+        """Forget all keyframes. The camera is the same: its calibration stays."""
+        self._known = Known(self.calibration, self._readout_sigma_s)
         self.loops = 0
         """How many recognised places were joined."""
         self._recent: deque[tuple[int, Pose]] = deque(maxlen=_RECENT)
@@ -69,6 +76,14 @@ class BackEnd:
         self._pairs: dict[tuple[int, int], _Pair] = {}
         self._follows: dict[int, int] = {}  # keyframes that were dropped: whom they move with
         self._loop = LoopDetector(self._config.loop)
+        self._suspected: Recognised | None = None  # by the last keyframe, and not yet believed
+
+    def start_from(self, readout_s: float | None) -> None:
+        """Begin with what a saved map knows of the shutter; None or 0 where it knows nothing."""
+        if readout_s:
+            self.calibration = replace(self.calibration, readout_s=readout_s)
+            self._readout_sigma_s = _SAVED_SIGMA_S
+        self.reset()
 
     def observe(self, stamp_ns: int, T_world_camera: Pose) -> None:
         """Take the pose of every tracked frame, in order of time: they tell velocities."""
@@ -98,8 +113,8 @@ class BackEnd:
         stamp_ns = keyframe.frame.stamp_ns
         self._poses = {known: poses.get(known, pose) for known, pose in self._poses.items()}
         self.observe(stamp_ns, keyframe.T_world_camera)
-        twist = self._twist(stamp_ns, keyframe.T_world_camera)
-        view = View.of(keyframe, twist)
+        self._follow_velocity()
+        view = View.of(keyframe, velocity_at(stamp_ns, self._recent))
         corners = find_corners(view, self._config.bundle)
         self._poses[stamp_ns], self._views[stamp_ns] = keyframe.T_world_camera, view
         for other in self._partners(corners):
@@ -111,21 +126,29 @@ class BackEnd:
         self._drop_redundant()
         return transforms
 
+    @property
+    def readout_s(self) -> float:
+        """
+        The readout time as far as it is known: 0 while it might as well be.
+
+        It is the positive-part estimator of James and Stein (1961) for a single number.
+        """
+        measured_s = self.calibration.readout_s
+        doubt = 2 * self._readout_sigma_s / max(abs(measured_s), self._readout_sigma_s)
+        return measured_s * max(1 - doubt**2, 0.0)
+
     def sweep(self, stamp_ns: int) -> Array:
         """Return the motion while a keyframe was read out, (rho, phi) in its frame, [6]."""
         view = self._views.get(stamp_ns)
-        return np.zeros(6) if view is None else self.calibration.readout_s * view.twist
+        return np.zeros(6) if view is None else self.readout_s * view.twist
 
-    def _twist(self, stamp_ns: int, T_world_camera: Pose) -> Array:
-        """Return the velocity since the frame before, in the camera's frame, [6]."""
-        earlier = [entry for entry in self._recent if entry[0] < stamp_ns]
-        if not earlier:
-            return np.zeros(6)
-        before_ns, T_before = earlier[-1]
-        step_s = (stamp_ns - before_ns) * 1e-9
-        if step_s > _LONGEST_STEP_S:
-            return np.zeros(6)
-        return np.asarray(se3.log(se3.inverse(T_before) @ T_world_camera) / step_s)
+    def _follow_velocity(self) -> None:
+        """Measure the velocity at the last keyframe again: what came after it is known now."""
+        if not self._views:
+            return
+        stamp_ns, view = next(reversed(self._views.items()))
+        twist = velocity_at(stamp_ns, self._recent)
+        self._views[stamp_ns] = replace(view, twist=twist)
 
     def _relative(self, other: int, one: int) -> Pose:
         """Return T_other_one as it is now."""
@@ -163,6 +186,7 @@ class BackEnd:
             T_other_one,
             (views[0].twist, views[1].twist),
             self.calibration,
+            self._readout_sigma_s,
             views[1].camera.fx,
             self._config.bundle,
         )
@@ -175,21 +199,38 @@ class BackEnd:
         window = list(self._views)[-self._config.bundle.window - 1 :]
         among = [known for known in self._views if known not in joined and known not in window]
         found = self._loop.find(stamp_ns, among) if among else None
-        if found is not None and self._join(corners, found.stamp_ns, found.T_earlier_new):
+        if self._is_believed(found) and self._join(corners, found.stamp_ns, found.T_earlier_new):
             self.loops += 1
+        self._suspected = found
+
+    def _is_believed(self, found: Recognised | None) -> TypeGuard[Recognised]:
+        """Return whether a place is sure, or the keyframe before says the same."""
+        if found is None:
+            return False
+        if found.inliers >= self._config.loop.sure_inliers:
+            return True
+        return self._suspected is not None and agree(self._suspected, found, self._poses)
 
     def _renew(self) -> None:
-        """Condense again the pairs whose calibration has become the most wrong."""
-        off = {
-            key: abs(pair.factor.calibration.readout_s - self.calibration.readout_s)
-            for key, pair in self._pairs.items()
-        }
+        """Condense again the pairs whose velocities or readout have become the most wrong."""
+        off = {key: self._off_rad(key) for key in self._pairs}
         worst = sorted(off, key=lambda key: -off[key])[:_RENEWED]
         for one, other in worst:
-            if off[one, other] > _READOUT_OFF_S:
+            if off[one, other] > _OFF_RAD:
                 pair = self._pairs[one, other]
                 start = pair.factor.T_other_one
                 pair.factor = self._condense(pair.shared, one, other, start)
+
+    def _off_rad(self, key: tuple[int, int]) -> float:
+        """Return how far the images of a pair are bent otherwise than it was condensed with."""
+        factor = self._pairs[key].factor
+        readout_s = abs(self.calibration.readout_s) + self._readout_sigma_s
+        wrong_s = abs(factor.held_readout_s - self.calibration.readout_s)
+        return max(
+            wrong_s * float(np.linalg.norm(self._views[stamp_ns].twist[3:]))
+            + readout_s * float(np.linalg.norm(self._views[stamp_ns].twist[3:] - twist[3:]))
+            for stamp_ns, twist in zip(key, factor.twists, strict=True)
+        )
 
     def _solve(self) -> dict[int, Pose]:
         """Solve for all poses; return what moves by enough."""
@@ -202,8 +243,10 @@ class BackEnd:
         if not edges:
             return {}
         before = [self._poses[stamp_ns] for stamp_ns in stamps]
-        solution = solve(before, edges, self.calibration, self._config.bundle)
+        solution = solve(before, edges, self.calibration, self._known, self._config.bundle)
         self.calibration = solution.calibration
+        sigma_s = max(_OVERCONFIDENT * solution.readout_sigma_s, _LEAST_SIGMA_S)
+        self._readout_sigma_s = min(sigma_s, self._known.readout_sigma_s)
         moved = {
             stamp_ns: new @ se3.inverse(old)
             for stamp_ns, new, old in zip(stamps, solution.poses, before, strict=True)

@@ -45,6 +45,14 @@ class Calibration:
         return cls(vector[:BENDS].copy(), float(vector[BENDS]))
 
 
+@dataclass(frozen=True)
+class Known:
+    """What is known of a calibration before any keyframe has been seen."""
+
+    calibration: Calibration
+    readout_sigma_s: float
+
+
 def bend_functions(tangents: Array) -> Array:
     """
     Return the functions that a bend is made of, at viewing rays.

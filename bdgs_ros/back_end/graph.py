@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
-from bdgs_ros.back_end.calibration import BENDS, SIZE, Calibration
+from bdgs_ros.back_end.calibration import BENDS, SIZE, Calibration, Known
 from bdgs_ros.back_end.pair import PairFactor
 from bdgs_ros.core import se3
 from bdgs_ros.core.config.back_end import BundleConfig
@@ -47,12 +47,15 @@ class Solution:
     poses: list[Pose]
     """T_world_camera in the order given; the first one is where it was."""
     calibration: Calibration
+    readout_sigma_s: float
+    """How well the readout is known, if the pairs are independent of each other."""
 
 
 def solve(
     poses: Sequence[Pose],
     edges: Sequence[Edge],
     calibration: Calibration,
+    known: Known,
     config: BundleConfig,
 ) -> Solution:
     """
@@ -69,8 +72,10 @@ def solve(
         2020), so that a true loop far from the present poses can pull them.
     calibration : Calibration
         Start.
+    known : Known
+        Of the calibration, beforehand.
     config : BundleConfig
-        What is known beforehand.
+        Noise.
 
     """
     world = np.array(poses)
@@ -79,7 +84,7 @@ def solve(
     chain = _neighbours(world)
     sigma = np.repeat([config.odometry_m, config.odometry_rad], 3)
     chain_information = np.broadcast_to(np.diag(sigma**-2), (len(chain.one), 6, 6))
-    known = np.append(np.full(BENDS, config.bend_sigma), config.readout_sigma_s) ** -2
+    sure = np.append(np.full(BENDS, config.bend_sigma), known.readout_sigma_s) ** -2
     wide = np.inf
     for _ in range(_ROUNDS):
         system = _System(len(world))
@@ -89,7 +94,7 @@ def solve(
         system.add(world, pairs, xi, vector, 1 / (1 + error / wide) ** 2)
         drift = _apart(world, chain)
         system.add_motion(world, chain, chain_information, drift)
-        system.add_known(known, vector)
+        system.add_known(sure, vector - known.calibration.vector)
         step = system.solve()
         moves = step[: 6 * len(world)].reshape(-1, 6)
         world = np.array([se3.exp(move) @ T for move, T in zip(moves, world, strict=True)])
@@ -97,7 +102,9 @@ def solve(
         if wide == 1.0 and np.abs(step).max() < _SETTLED:
             break
     return Solution(
-        [se3.orthonormalise(T) for T in world], Calibration.of_vector(np.asarray(vector))
+        [se3.orthonormalise(T) for T in world],
+        Calibration.of_vector(np.asarray(vector)),
+        system.last_sigma(),
     )
 
 
@@ -193,7 +200,7 @@ class _System:
         self._add_blocks(pairs, adjoint, information, pull)
 
     def add_known(self, information: Array, vector: Array) -> None:
-        """Add what is known of the calibration; hold the first pose."""
+        """Add how far the calibration is from what is known of it; hold the first pose."""
         self._common += np.diag(information)
         self._right_common += information * vector
         self._blocks[0, 0] += _FIXED * np.eye(6)
@@ -214,14 +221,24 @@ class _System:
 
     def solve(self) -> Array:
         """Return the step of all unknowns, [6 N + 6]."""
+        right = np.concatenate([self._right.ravel(), self._right_common])
+        return np.asarray(-cho_solve(self._factor(), right))
+
+    def last_sigma(self) -> float:
+        """Return the standard deviation of the last unknown."""
+        unit = np.zeros(6 * self._count + SIZE)
+        unit[-1] = 1
+        return float(np.sqrt(cho_solve(self._factor(), unit)[-1]))
+
+    def _factor(self) -> tuple[Array, bool]:
         size = 6 * self._count
         matrix = np.empty((size + SIZE, size + SIZE))
         matrix[:size, :size] = self._blocks.transpose(0, 2, 1, 3).reshape(size, size)
         matrix[:size, size:] = self._mixed.reshape(size, SIZE)
         matrix[size:, :size] = matrix[:size, size:].T
         matrix[size:, size:] = self._common
-        right = np.concatenate([self._right.ravel(), self._right_common])
-        return np.asarray(-cho_solve(cho_factor(matrix), right))
+        triangle, is_lower = cho_factor(matrix)
+        return np.asarray(triangle), bool(is_lower)
 
 
 def _inverses(T: Array) -> Array:

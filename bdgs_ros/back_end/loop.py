@@ -1,25 +1,29 @@
 """
 Places seen before, found without knowing where the camera is.
 
-Keyframes that the present poses do not bring together are compared by ORB features. A place is
-recognised where PnP explains enough of the matches; whether it is believed is decided by the
-corners that are then followed (`bundle`), and by the rest of the graph.
+Keyframes that the present poses do not bring together are looked up by the words of their ORB
+features, and the likeliest compared. A place is recognised where PnP explains enough of the
+matches; it is believed where very many agree or the keyframe before said the same, and the
+corners can then be followed (`bundle`). The rest of the graph may still overrule it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bdgs_ros.core import se3
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.config.back_end import LoopConfig
 from bdgs_ros.core.types import Keyframe, Pose
 from bdgs_ros.tracking.features import FeatureExtractor, Features, match
 from bdgs_ros.tracking.pnp import locate
+from bdgs_ros.tracking.word_index import WordIndex, Words
 
+_AGREE_M, _AGREE_RAD = 0.15, 0.1  # two recognised places, each good to a few centimetres
 _LEAST_SPREAD = 0.03  # of their distance, in the second direction
 
 
@@ -27,9 +31,20 @@ _LEAST_SPREAD = 0.03  # of their distance, in the second direction
 class Recognised:
     """An earlier keyframe that a new one shows again."""
 
+    new_ns: int
     stamp_ns: int
+    """Of the earlier one."""
     T_earlier_new: Pose
     inliers: int
+
+
+@dataclass(frozen=True)
+class _Known:
+    """What is remembered of a keyframe."""
+
+    features: Features
+    words: Words
+    camera: PinholeCamera
 
 
 class LoopDetector:
@@ -46,13 +61,14 @@ class LoopDetector:
     def __init__(self, config: LoopConfig) -> None:
         self._config = config
         self._extractor = FeatureExtractor(config.features)
-        self._known: dict[int, tuple[Features, PinholeCamera]] = {}
-        self._turn = 0
+        self._index = WordIndex()
+        self._known: dict[int, _Known] = {}
 
     def add(self, keyframe: Keyframe) -> None:
         """Remember a keyframe."""
         features = self._extractor.extract(keyframe.frame, keyframe.p_dynamic)
-        self._known[keyframe.frame.stamp_ns] = features, keyframe.frame.camera
+        words = self._index.words(features.descriptors)
+        self._known[keyframe.frame.stamp_ns] = _Known(features, words, keyframe.frame.camera)
 
     def forget(self, stamp_ns: int) -> None:
         """Drop a keyframe that is no longer kept."""
@@ -67,7 +83,7 @@ class LoopDetector:
         stamp_ns : int
             Of the new keyframe.
         among : sequence of int
-            Stamps of those that may be compared. Not more than `candidates` are, in turn.
+            Stamps of those that may be compared. The likeliest `candidates` are.
 
         Returns
         -------
@@ -75,16 +91,15 @@ class LoopDetector:
             The one with the most matches that agree on a pose.
 
         """
-        count = min(self._config.candidates, len(among))
-        chosen = [among[(self._turn + i * len(among) // count) % len(among)] for i in range(count)]
-        self._turn += 1
-        found = [self._compare(stamp_ns, earlier) for earlier in chosen]
+        words = [self._known[earlier].words for earlier in among]
+        likely = self._index.likely(self._known[stamp_ns].words, words, self._config.candidates)
+        found = [self._compare(stamp_ns, among[i]) for i in likely]
         seen = [recognised for recognised in found if recognised is not None]
         return max(seen, key=lambda recognised: recognised.inliers, default=None)
 
     def _compare(self, new: int, earlier: int) -> Recognised | None:
-        features, _ = self._known[new]
-        others, camera = self._known[earlier]
+        features = self._known[new].features
+        others, camera = self._known[earlier].features, self._known[earlier].camera
         pairs = match(features, others, self._config.features)
         if len(pairs) < self._config.min_inliers:
             return None
@@ -96,7 +111,31 @@ class LoopDetector:
         inliers = points[located.inliers]
         if not _is_spread(inliers):
             return None
-        return Recognised(earlier, located.T_current_reference, len(located.inliers))
+        return Recognised(new, earlier, located.T_current_reference, len(located.inliers))
+
+
+def agree(one: Recognised, other: Recognised, poses: Mapping[int, Pose]) -> bool:
+    """
+    Return whether two keyframes recognise places that are to each other as they are themselves.
+
+    Parameters
+    ----------
+    one, other : Recognised
+        Of two keyframes close in time.
+    poses : mapping of int to ndarray, shape (4, 4)
+        T_world_camera by stamp, before the loop is closed.
+
+    """
+    if not {one.stamp_ns, one.new_ns, other.stamp_ns, other.new_ns} <= set(poses):
+        return False
+    # By how much each of the two would move the present into the past.
+    moves = [
+        poses[r.stamp_ns] @ r.T_earlier_new @ se3.inverse(poses[r.new_ns]) for r in (one, other)
+    ]
+    at = poses[other.new_ns]
+    apart = se3.inverse(moves[0] @ at) @ moves[1] @ at
+    near = float(np.linalg.norm(apart[:3, 3])) < _AGREE_M
+    return near and se3.rotation_angle_rad(apart) < _AGREE_RAD
 
 
 def _is_spread(points: NDArray[np.float32]) -> bool:

@@ -13,7 +13,7 @@ over all keyframes (`graph`) has no landmarks and costs milliseconds.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ from bdgs_ros.core.types import Pose
 Array = NDArray[np.float64]
 
 UNKNOWNS = 6 + SIZE
+_FREE = [*range(6), 6 + BENDS]  # of the unknowns, while a pair is condensed
 _ROUNDS = 5
 _SETTLED = 1e-5
 _LEAST_INVERSE, _MOST_INVERSE = 0.05, 5.0  # 1/m
@@ -40,6 +41,10 @@ class PairFactor:
     """Where it was linearised."""
     calibration: Calibration
     """With which."""
+    held_readout_s: float
+    """Near which the readout was looked for."""
+    twists: tuple[Array, Array]
+    """Velocities of the one and of the other view."""
     information: Array
     """L, shape (12, 12)."""
     gradient: Array
@@ -65,6 +70,7 @@ def condense(
     T_other_one: Pose,
     twists: tuple[Array, Array],
     calibration: Calibration,
+    readout_sigma_s: float,
     focal_px: float,
     config: BundleConfig,
 ) -> PairFactor:
@@ -80,29 +86,43 @@ def condense(
     twists : pair of ndarray, shape (6,)
         Velocities of the one and of the other view, in their own frames.
     calibration : Calibration
-        Held; the factor says how the optimum depends on it.
+        What is known; the factor says how the optimum depends on it.
+    readout_sigma_s : float
+        How well the readout is known. A wrong one would make outliers of the corners that tell
+        it, so the pair is linearised at its own.
     focal_px : float
         Of the other view.
     config : BundleConfig
         Noise.
 
     """
-    T = np.asarray(T_other_one, np.float64)
+    T, at = np.asarray(T_other_one, np.float64), calibration
     bent = bend_functions(shared.tangents) @ calibration.bend
     inverse = shared.inverse_depth + bent
     for i in range(_ROUNDS):
-        linear = linearise(shared, T, twists, calibration, inverse, focal_px, config)
+        linear = linearise(shared, T, twists, at, inverse, focal_px, config)
         weight = shared.p_static[:, None] * _weights(linear.residuals, config.dof)
         information, gradient, back = _eliminate(linear, weight)
-        pose = information[:6, :6] + 1e-6 * np.diag(np.diag(information)[:6]) + 1e-3 * np.eye(6)
-        step = np.asarray(-np.linalg.solve(pose, gradient[:6]), np.float64)
+        known = (at.readout_s - calibration.readout_s, readout_sigma_s)
+        step = _step(information[_FREE][:, _FREE], gradient[_FREE], known)
         if i == _ROUNDS - 1 or np.abs(step).max() < _SETTLED:
             break
-        change = back[0] + back[1][:, :6] @ step
+        change = back[0] + back[1][:, _FREE] @ step
         inverse = np.clip(inverse + change, _LEAST_INVERSE, _MOST_INVERSE)
-        T = se3.exp(step) @ T
+        T = se3.exp(step[:6]) @ T
+        at = replace(at, readout_s=at.readout_s + float(step[6]))
     inliers = int((np.abs(linear.residuals[:, :3]) < 3).all(axis=1).sum())
-    return PairFactor(T, calibration, information, gradient, inliers)
+    return PairFactor(T, at, calibration.readout_s, twists, information, gradient, inliers)
+
+
+def _step(information: Array, gradient: Array, known: tuple[float, float]) -> Array:
+    """Return the step of motion and readout, [7], of which an offset and its sigma are known."""
+    damped = information + 1e-6 * np.diag(np.diag(information)) + 1e-3 * np.eye(7)
+    offset_s, sigma_s = known
+    damped[6, 6] += sigma_s**-2
+    pull = gradient.copy()
+    pull[6] += offset_s / sigma_s**2
+    return np.asarray(-np.linalg.solve(damped, pull), np.float64)
 
 
 def linearise(
@@ -139,12 +159,11 @@ def linearise(
 
     bend_one, bend_other = bend_functions(shared.tangents), bend_functions(shared.tangents_other)
     by_unknowns = np.zeros((len(shared), 4, UNKNOWNS))
-    slots = [*range(6), 6 + BENDS]
     for axis in range(2):
         by_at = by_motion[:, axis] - at[:, axis, None] * by_motion[:, 2]
-        by_unknowns[:, axis, slots] = px * depth[:, None] * by_at
+        by_unknowns[:, axis, _FREE] = px * depth[:, None] * by_at
     known = measured[:, None] / sigma
-    by_unknowns[:, 2, slots] = -known * (seen * depth)[:, None] * by_motion[:, 2]
+    by_unknowns[:, 2, _FREE] = -known * (seen * depth)[:, None] * by_motion[:, 2]
     by_unknowns[:, 2, 6 : 6 + BENDS] = -known * bend_other
     by_unknowns[:, 3, 6 : 6 + BENDS] = -bend_one / sigma
 

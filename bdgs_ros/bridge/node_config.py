@@ -102,6 +102,9 @@ class TrackingNodeConfig(GraphConfig):
         0.5, 'older labels are not used (realtime)', unit='s', low=0.0, high=10.0
     )
     frame_queue: int = param(15, 'frames that may wait for tracking (realtime)', low=1, high=1000)
+    map_file: str = param(
+        '', 'where bdgs/save_map writes and bdgs/load_map reads; may change at run time'
+    )
     trajectory_file: str = param('', 'where bdgs/save_trajectory writes; may change at run time')
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
 

@@ -18,6 +18,7 @@ from bdgs_ros.core.types import (
     Keyframe,
     Pose,
     ProbabilityImage,
+    RgbdFrame,
 )
 from bdgs_ros.mapping.vignette import Vignette
 
@@ -108,6 +109,14 @@ class MapKeyframe:
     def T_camera_world(self) -> Pose:
         """World to camera, shape (4, 4)."""
         return se3.inverse(self.T_world_camera)
+
+
+def photograph(kept: MapKeyframe) -> Keyframe:
+    """Return a keyframe as a photograph of a place that may be recognised."""
+    level = kept.levels[0]
+    frame = RgbdFrame(kept.stamp_ns, level.image, level.depth_m, level.camera)
+    moving = np.where(level.static, kept.p_dynamic, np.uint8(255))
+    return Keyframe(frame, kept.T_world_camera, moving)
 
 
 def shrink(keyframe: Keyframe, width: int) -> Keyframe:

@@ -7,6 +7,7 @@ from pathlib import Path
 from bdgs_ros.core.config import BeliefConfig
 from bdgs_ros.core.errors import MapError
 from bdgs_ros.core.files import previous_folder, remove_folder, write_folder_aside
+from bdgs_ros.core.types import Keyframe
 from bdgs_ros.mapping.gaussians import GaussianMap
 from bdgs_ros.mapping.keyframe_store import (
     KeyframeSet,
@@ -14,6 +15,7 @@ from bdgs_ros.mapping.keyframe_store import (
     read_keyframes,
     write_keyframes,
 )
+from bdgs_ros.mapping.keyframes import photograph
 from bdgs_ros.mapping.ply import load_ply, save_ply, write_points
 
 
@@ -102,6 +104,20 @@ def load_map(
             'alone'
         )
     return gaussians, kept
+
+
+def load_places(path: Path) -> list[Keyframe]:
+    """
+    Read the keyframes of a saved map as places that may be recognised; none without a folder.
+
+    Raises
+    ------
+    MapError
+        As `load_map`.
+
+    """
+    _, kept = load_map(path, BeliefConfig(), 1)
+    return [photograph(keyframe) for keyframe in kept.keyframes]
 
 
 def _folder_of(path: Path, count: int) -> Path | None:

@@ -37,6 +37,7 @@ from bdgs_ros.mapping.keyframes import (
     build_levels,
     is_dynamic,
     most_redundant,
+    photograph,
     shrink,
 )
 from bdgs_ros.mapping.lift import lift
@@ -389,11 +390,7 @@ class Mapper:
 
     def photographs(self) -> Iterator[Keyframe]:
         """Yield the keyframes of the map at its size: places that may be recognised."""
-        for known in self.keyframes:
-            level = known.levels[0]
-            frame = RgbdFrame(known.stamp_ns, level.image, level.depth_m, level.camera)
-            moving = np.where(level.static, known.p_dynamic, np.uint8(255))
-            yield Keyframe(frame, known.T_world_camera, moving)
+        return map(photograph, self.keyframes)
 
     def save(self, path: Path, *, keyframes: bool = True) -> None:
         """

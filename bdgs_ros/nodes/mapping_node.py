@@ -289,7 +289,7 @@ class MappingNode(GraphNode):
         with self._lock:
             self._mapper.load(file)
             self._mapper.history.begin_run()
-            self._back_end.reset()
+            self._back_end.start_from(self._mapper.readout_s)
             count = len(self._mapper.map)
         self._version += 1
         return f"{count} Gaussians from '{file}'"

@@ -21,10 +21,13 @@ from bdgs_ros.bridge.runner import GraphNode, run
 from bdgs_ros.bridge.services import serve_switch, serve_trigger
 from bdgs_ros.bridge.status import FrameState, FrameStatus, status_to_message
 from bdgs_ros.bridge.worker import Worker
-from bdgs_ros.core.errors import ConfigError, DatasetError
-from bdgs_ros.core.types import RgbdFrame, TrackingResult, TrackingStatus
+from bdgs_ros.core.errors import ConfigError, DatasetError, MapError
+from bdgs_ros.core.types import Keyframe, RgbdFrame, TrackingResult, TrackingStatus
 from bdgs_ros.data.trajectory_io import write_trajectory
+from bdgs_ros.mapping.map_files import load_places
 from bdgs_ros.tracking.camera_tracker import CameraTracker
+
+_AT_RUN_TIME = ('map_file', 'trajectory_file')
 
 
 class TrackingNode(GraphNode):
@@ -32,7 +35,7 @@ class TrackingNode(GraphNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__('tracking_node', **options)
-        config = parameters.declare(self, TrackingNodeConfig(), runtime=('trajectory_file',))
+        config = parameters.declare(self, TrackingNodeConfig(), runtime=_AT_RUN_TIME)
         cv2.setNumThreads(1)
         self._config = config
         self._paused = False
@@ -78,9 +81,22 @@ class TrackingNode(GraphNode):
             if not answered:
                 return False
             if view is not None:
-                self._tracker.start_from(view)
+                self._tracker.start_from(view, self._places())
         self._has_begun = True
         return True
+
+    def _places(self) -> list[Keyframe]:
+        """Read the keyframes of the map that mapping began with: the camera may be anywhere."""
+        file = str(self.get_parameter('map_file').value)
+        if not file or not self._config.begins_in_map:
+            return []
+        try:
+            places = load_places(Path(file))
+        except MapError as error:  # on another computer, perhaps
+            self.get_logger().warning(f'the camera must start near start_pose: {error}')
+            return []
+        self.get_logger().info(f"{len(places)} places to recognise from '{file}'")
+        return places
 
     def _track(self, raw: RawFrame, frame: RgbdFrame) -> None:
         labels = self._feedback.labels(frame)

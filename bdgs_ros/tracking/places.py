@@ -1,9 +1,6 @@
 """
 Keyframes by which a lost camera finds where it is: retrieval by binary words, then geometry.
 
-An ORB descriptor is hashed by a few random choices of its bits; each hash is a word. Images of
-one place share rare words, which an inverse-frequency vote finds in about a millisecond. It is the
-bag of words of Galvez-Lopez and Tardos (TRO 2012) with hashes in place of a trained vocabulary.
 The likeliest places are matched feature by feature, and PnP with RANSAC says where the camera is.
 """
 
@@ -22,8 +19,8 @@ from bdgs_ros.core.config.tracking import FeatureConfig, PlacesConfig
 from bdgs_ros.core.types import Pose, ProbabilityImage, RgbdFrame
 from bdgs_ros.tracking.features import FeatureExtractor, Features, match
 from bdgs_ros.tracking.pnp import locate
+from bdgs_ros.tracking.word_index import WordIndex, Words
 
-_TABLES, _BITS = 8, 12  # of the hash: words per feature, and bits of each
 _METRES_PER_RADIAN = 2.0  # a turn moves the view as far as this at usual depths
 
 
@@ -39,7 +36,7 @@ class Place:
     p_dynamic: ProbabilityImage
     features: Features | None = None
     """None until somebody had the time."""
-    words: NDArray[np.int64] | None = None
+    words: Words | None = None
 
 
 @dataclass(frozen=True)
@@ -69,7 +66,7 @@ class Places:
         self._config = config
         self._matching = replace(features, count=config.features)
         self._extractor = FeatureExtractor(self._matching)
-        self._hash = _WordHash()
+        self._index = WordIndex()
         self._places: list[Place] = []
 
     def clear(self) -> None:
@@ -123,7 +120,7 @@ class Places:
             place.camera,
         )
         features = self._extractor.extract(frame, place.p_dynamic)
-        return replace(place, features=features, words=self._hash.words(features.descriptors))
+        return replace(place, features=features, words=self._index.words(features.descriptors))
 
     def find(self, frame: RgbdFrame, p_dynamic: ProbabilityImage) -> list[Sighting]:
         """
@@ -151,12 +148,10 @@ class Places:
     def _likely(self, query: Place) -> list[Place]:
         """Return the places that share the rarest words with the query, the best first."""
         known = [p.words for p in self._places if p.words is not None]
-        if query.words is None or not query.words.size or not known:
+        if query.words is None or len(known) < len(self._places):
             return []
-        sizes = np.array([words.size for words in known])
-        votes = self._hash.votes(query.words, np.concatenate(known), sizes)
-        order = np.argsort(-votes, kind='stable')[: self._config.candidates]
-        return [self._places[i] for i in order if votes[i] > 0]
+        likely = self._index.likely(query.words, known, self._config.candidates)
+        return [self._places[i] for i in likely]
 
     def _look(self, place: Place, query: Place) -> Sighting | None:
         """Match feature by feature, and locate the camera."""
@@ -174,47 +169,6 @@ class Places:
             return None
         T_place_camera = se3.inverse(found.T_current_reference)
         return Sighting(place, place.T_world_camera @ T_place_camera, len(found.inliers))
-
-
-class _WordHash:
-    """Words of descriptors: random choices of their bits, the same in every run."""
-
-    def __init__(self) -> None:
-        rng = np.random.default_rng(0)
-        bits = 256  # of an ORB descriptor
-        self._bits = np.stack([rng.choice(bits, _BITS, replace=False) for _ in range(_TABLES)])
-        self._size = _TABLES << _BITS
-
-    def words(self, descriptors: NDArray[np.uint8]) -> NDArray[np.int64]:
-        """Return the words of descriptors, shape (N, 32), as numbers, shape (N * tables,)."""
-        bits = np.unpackbits(descriptors, axis=1)[:, self._bits].astype(np.int64)
-        return np.asarray((bits @ (1 << np.arange(_BITS)) + self._first()).ravel(), np.int64)
-
-    def _first(self) -> NDArray[np.int64]:
-        return np.arange(_TABLES) << _BITS
-
-    def votes(
-        self, query: NDArray[np.int64], words: NDArray[np.int64], sizes: NDArray[np.int64]
-    ) -> NDArray[np.float64]:
-        """
-        Say how much each image shares with a query, rare words counting more.
-
-        Parameters
-        ----------
-        query : ndarray, shape (Q,)
-            Words of the query.
-        words : ndarray, shape (W,)
-            Words of all images, one image after the other.
-        sizes : ndarray, shape (K,)
-            Words of each image.
-
-        """
-        frequency = np.bincount(words, minlength=self._size)
-        weight = np.zeros(self._size)
-        weight[query] = np.log1p(len(words) / np.maximum(frequency[query], 1))
-        owner = np.repeat(np.arange(len(sizes)), sizes)
-        shared = np.bincount(owner, weight[words], len(sizes))
-        return np.asarray(shared / np.sqrt(np.maximum(sizes, 1)))
 
 
 def _shrink(

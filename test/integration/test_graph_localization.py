@@ -30,6 +30,7 @@ from bdgs_ros.data.trajectory_io import POSE_COLUMNS, read_trajectory  # noqa: E
 from bdgs_ros.pipeline import BdgsSlam  # noqa: E402
 
 HALF = 10  # frames that the map is made of
+TURNED_AWAY = '0 0 0 0 0.7071 0 0.7071'  # by 90 degrees: nothing of the map is seen there
 DEATH = 16  # frames until tracking is killed: the camera is 2 cm from the origin then
 
 
@@ -148,6 +149,31 @@ def test_localising_in_a_saved_map(
     metrics = json.loads((out / 'metrics.json').read_text())['metrics']
     assert metrics['frames_lost']['value'] == 0
     assert metrics['ate_final_rmse']['value'] < 2.0
+
+
+def test_a_camera_that_is_elsewhere_in_the_map_is_found(
+    graph: Graph, bag: Path, settings: dict[str, object], tmp_path: Path
+) -> None:
+    wide = {**settings, 'mapping__width': 320}
+    slam = BdgsSlam(config_of(wide))
+    sequence = BagSequence(bag)
+    expected = [slam.process(sequence[i]).tracking.T_world_camera for i in range(HALF)]
+    slam.mapper.save(tmp_path / 'map.ply')
+    out = tmp_path / 'out'
+    node = graph.node(
+        'slam_node', bag=bag, output=out, exit_at_end=True, mode='lockstep',
+        map_file=tmp_path / 'map.ply', localization=True,
+        start_pose=f'"{TURNED_AWAY}"', **wide,
+    )  # fmt: skip
+    assert node.wait(120.0) == 0, node.text()
+    assert 'places to recognise' in node.text()
+    live = read_trajectory(out / 'trajectory.txt')
+    assert len(live) > len(sequence) / 2, node.text()
+    stamps = [frame.stamp_ns for frame in sequence]
+    for stamp_ns, position in zip(live.stamps_ns, live.positions, strict=True):
+        index = stamps.index(int(stamp_ns))
+        if index < HALF:
+            assert position == pytest.approx(expected[index][:3, 3], abs=0.02)
 
 
 def seconds_in(bag: Path, index: int) -> float:

@@ -10,7 +10,7 @@ import pytest
 
 from bdgs_ros.back_end.back_end import BackEnd
 from bdgs_ros.back_end.corners import View, find_corners, follow
-from bdgs_ros.back_end.loop import LoopDetector
+from bdgs_ros.back_end.loop import LoopDetector, Recognised, agree
 from bdgs_ros.core import se3
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.config import BackEndConfig, with_values
@@ -130,6 +130,27 @@ def test_the_same_poster_in_another_room_is_no_place() -> None:
     other[200:260, 380:440] = one[200:260, 380:440]
     loop = detector({0: one, 1: other})
     assert loop.find(SECOND, [0]) is None
+
+
+def test_two_keyframes_agree_on_a_loop_or_do_not() -> None:
+    poses = {i: at(x) for i, x in enumerate([0.0, 0.1, 5.0, 5.1])}
+    one, same = Recognised(2, 0, at(0.0), 30), Recognised(3, 1, at(0.02), 30)
+    assert agree(one, same, poses)
+    assert not agree(one, Recognised(3, 0, at(0.6), 30), poses)
+    assert not agree(one, Recognised(3, 99, at(0.0), 30), poses)
+
+
+def test_the_shutter_outlives_a_reset_and_comes_with_a_map() -> None:
+    back_end = BackEnd(CONFIG)
+    assert back_end.readout_s == 0.0
+    back_end.start_from(0.025)
+    assert back_end.readout_s == pytest.approx(0.025, abs=0.001)
+    run(back_end, [STEP_M * i for i in range(4)], np.zeros(6))
+    back_end.reset()
+    assert back_end.readout_s == pytest.approx(0.025, abs=0.003)
+    fresh = BackEnd(CONFIG)
+    fresh.start_from(None)
+    assert fresh.readout_s == 0.0
 
 
 def loop_error_m(enabled: bool) -> tuple[float, int]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from bdgs_ros.back_end.calibration import Calibration, bend_functions
+from bdgs_ros.back_end.calibration import Calibration, Known, bend_functions
 from bdgs_ros.back_end.corners import Shared
 from bdgs_ros.back_end.graph import Edge, solve
 from bdgs_ros.back_end.pair import PairFactor, condense, linearise
@@ -17,6 +17,8 @@ from bdgs_ros.core.config import BackEndConfig
 CONFIG = BackEndConfig().bundle
 FOCAL = 500.0
 STILL = np.zeros(6)
+SIGMA_S = 0.03
+UNKNOWN = Known(Calibration.perfect(), SIGMA_S)
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,7 @@ def test_derivatives_agree_with_differences() -> None:
 
 def pair(room: Room, T_one: np.ndarray, T_other: np.ndarray, start: np.ndarray) -> PairFactor:
     shared = room.share(T_one, T_other)
-    return condense(shared, start, (STILL, STILL), Calibration.perfect(), FOCAL, CONFIG)
+    return condense(shared, start, (STILL, STILL), Calibration.perfect(), SIGMA_S, FOCAL, CONFIG)
 
 
 def test_the_motion_between_two_views_is_found() -> None:
@@ -117,10 +119,12 @@ def test_movers_have_no_say() -> None:
     walking = np.arange(60) < 25
     there = shared.tangents_other + np.where(walking[:, None], [0.05, 0.0], 0.0)
     known = replace(shared, tangents_other=there, p_static=np.where(walking, 0.0, 1.0))
-    found = condense(known, truth, (STILL, STILL), Calibration.perfect(), FOCAL, CONFIG)
+    found = condense(known, truth, (STILL, STILL), Calibration.perfect(), SIGMA_S, FOCAL, CONFIG)
     np.testing.assert_allclose(found.T_other_one, truth, atol=1e-5)
     unknown = replace(known, p_static=np.ones(60))
-    fooled = condense(unknown, truth, (STILL, STILL), Calibration.perfect(), FOCAL, CONFIG)
+    fooled = condense(
+        unknown, truth, (STILL, STILL), Calibration.perfect(), SIGMA_S, FOCAL, CONFIG
+    )
     assert np.abs(fooled.T_other_one - truth).max() > 1e-4
 
 
@@ -139,7 +143,9 @@ def edges(room: Room, poses: list[np.ndarray], twists: list[np.ndarray]) -> list
             T = se3.inverse(start[other]) @ start[one]
             moving = twists[one], twists[other]
             perfect = Calibration.perfect()
-            found.append(Edge(one, other, condense(shared, T, moving, perfect, FOCAL, CONFIG)))
+            found.append(
+                Edge(one, other, condense(shared, T, moving, perfect, SIGMA_S, FOCAL, CONFIG))
+            )
     return found
 
 
@@ -153,7 +159,9 @@ def test_noisy_poses_are_put_right() -> None:
     room = Room.random(Calibration.perfect())
     truth = motions(8)
     still = [STILL] * 8
-    solution = solve(noisy(truth), edges(room, truth, still), Calibration.perfect(), CONFIG)
+    solution = solve(
+        noisy(truth), edges(room, truth, still), Calibration.perfect(), UNKNOWN, CONFIG
+    )
     assert worst_m(noisy(truth), truth) > 0.02
     assert worst_m(solution.poses, truth) < 0.001
     assert abs(solution.calibration.readout_s) < 0.001
@@ -166,14 +174,38 @@ def test_a_rolling_shutter_is_found_and_taken_out(readout_s: float) -> None:
     truth = motions(10)
     rng = np.random.default_rng(2)
     twists = [rng.normal(0, [0.2] * 3 + [0.5] * 3) for _ in truth]
-    solution = solve(noisy(truth), edges(room, truth, twists), Calibration.perfect(), CONFIG)
+    solution = solve(
+        noisy(truth), edges(room, truth, twists), Calibration.perfect(), UNKNOWN, CONFIG
+    )
     assert solution.calibration.readout_s == pytest.approx(readout_s, abs=0.002)
     np.testing.assert_allclose(solution.calibration.bend, bend, atol=0.005)
-    blind = replace(CONFIG, readout_sigma_s=1e-6)
-    without = solve(noisy(truth), edges(room, truth, twists), Calibration.perfect(), blind)
+    blind = Known(Calibration.perfect(), 1e-6)
+    without = solve(noisy(truth), edges(room, truth, twists), Calibration.perfect(), blind, CONFIG)
     assert worst_m(solution.poses, truth) < 0.003
     if readout_s:
         assert worst_m(without.poses, truth) > 2 * worst_m(solution.poses, truth)
+
+
+def test_a_pair_that_turned_back_tells_the_readout_at_once() -> None:
+    room = Room.random(Calibration(np.zeros(5), 0.025))
+    truth = motions(2)[1]
+    turning = np.array([0, 0, 0, 0, 1.8, 0])
+    shared = room.share(truth, se3.identity(), (turning, -turning))
+    known = Calibration.perfect(), SIGMA_S, FOCAL, CONFIG
+    factor = condense(shared, truth, (turning, -turning), *known)
+    assert factor.calibration.readout_s == pytest.approx(0.025, abs=0.001)
+    assert factor.inliers > 55
+    held = condense(shared, truth, (turning, -turning), Calibration.perfect(), 1e-6, *known[2:])
+    assert held.inliers < 45
+
+
+def test_what_is_known_of_the_shutter_is_kept_where_nothing_moves() -> None:
+    room = Room.random(Calibration.perfect())
+    truth = motions(4)
+    known = Known(Calibration(np.zeros(5), 0.02), 0.002)
+    solution = solve(truth, edges(room, truth, [STILL] * 4), known.calibration, known, CONFIG)
+    assert solution.calibration.readout_s == pytest.approx(0.02, abs=1e-4)
+    assert solution.readout_sigma_s == pytest.approx(0.002, rel=0.01)
 
 
 def test_a_pair_that_all_others_contradict_is_overruled() -> None:
@@ -181,5 +213,7 @@ def test_a_pair_that_all_others_contradict_is_overruled() -> None:
     truth = motions(8)
     good = edges(room, truth, [STILL] * 8)
     false = replace(good[0].factor, T_other_one=se3.exp(np.array([0.3, 0, 0, 0, 0, 0])))
-    solution = solve(noisy(truth), [*good, Edge(7, 0, false)], Calibration.perfect(), CONFIG)
+    solution = solve(
+        noisy(truth), [*good, Edge(7, 0, false)], Calibration.perfect(), UNKNOWN, CONFIG
+    )
     assert worst_m(solution.poses, truth) < 0.003

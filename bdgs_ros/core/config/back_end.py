@@ -45,8 +45,11 @@ class LoopConfig:
     """Places seen before, recognised without knowing where the camera is."""
 
     enabled: bool = param(True, 'look for places seen before')
-    candidates: int = param(8, 'earlier keyframes compared with a new one', low=1, high=1000)
+    candidates: int = param(3, 'likeliest keyframes compared with a new one', low=1, high=1000)
     min_inliers: int = param(25, 'matches that agree on one pose', low=6, high=1000)
+    sure_inliers: int = param(
+        60, 'so many are believed though the keyframe before saw no such place', low=6, high=1000
+    )
     min_share: float = param(0.4, 'of all matches', low=0.0, high=1.0)
     tolerance_px: float = param(4.0, 'of a match that agrees', unit='px', low=0.1, high=50.0)
     features: FeatureConfig = field(default_factory=lambda: FeatureConfig(count=400))
