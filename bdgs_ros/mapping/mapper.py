@@ -120,8 +120,7 @@ class Mapper:
         fine = shrink(keyframe, self._config.width)
         if self.frozen:
             return self.view(fine.frame.stamp_ns, fine.T_world_camera, fine.frame.camera)
-        fine = self._straighten(fine)
-        small = shrink(fine, self._config.growth_width)
+        fine, small = self._straighten(fine, shrink(fine, self._config.growth_width))
         agree = self._infer(small)
         static = self._look(small, agree)
         in_front = self._in_front(small, static)
@@ -139,13 +138,16 @@ class Mapper:
             current.stamp_ns, current.T_world_camera, fine.frame.camera, current.exposure
         )
 
-    def _straighten(self, keyframe: Keyframe) -> Keyframe:
+    def _straighten(self, fine: Keyframe, small: Keyframe) -> tuple[Keyframe, Keyframe]:
         """Learn the bend of the depth sensor, and take out of the depth what is known of it."""
-        frame = keyframe.frame
-        measured = RangeImage.of(shrink(keyframe, self._config.growth_width))
+        measured = RangeImage.of(small)
         for earlier in self._ranges:
             self.depth_bend.learn(measured, earlier)
         self._ranges = [*self._ranges, measured][-_PHOTOS:]
+        return self._unbent(fine), self._unbent(small)
+
+    def _unbent(self, keyframe: Keyframe) -> Keyframe:
+        frame = keyframe.frame
         depth_m = self.depth_bend.correct(frame.depth_m, frame.camera)
         return replace(keyframe, frame=replace(frame, depth_m=depth_m))
 
@@ -275,6 +277,8 @@ class Mapper:
         surface = fit_surface(level.depth_m, usable, level.camera, config.normal_px, sigma)
 
         def grow(pixels: Mask, belief: float) -> None:
+            if not pixels.any():
+                return
             new = lift(current, level, surface, pixels, belief, config)
             self.map.append(new, config.opacity, current.index)
             rows = np.arange(len(self.map) - len(new.means), len(self.map))
