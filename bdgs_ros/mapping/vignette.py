@@ -115,7 +115,7 @@ def _falloff(camera: PinholeCamera, coefficients: tuple[float, float]) -> Array:
     x = (np.arange(camera.width) - camera.cx) / camera.fx
     y = (np.arange(camera.height) - camera.cy) / camera.fy
     rho2 = ((y * y)[:, None] + x * x).astype(np.float32)
-    a, b = np.float32(coefficients)
+    a, b = (np.float32(value) for value in coefficients)
     image: Array = np.exp(np.clip((a + b * rho2) * rho2, _DARKEST, _BRIGHTEST))
     image.setflags(write=False)
     return image
