@@ -21,7 +21,7 @@ from bdgs_ros.core.types import (
 from bdgs_ros.detection.detector import Detector, LateDetector
 from bdgs_ros.detection.stage import DetectionStage
 from bdgs_ros.mapping.entrance import check_entrance, entrance
-from bdgs_ros.mapping.mapper import Mapper
+from bdgs_ros.mapping.mapper import Answer, Mapper
 from bdgs_ros.tracking.camera_tracker import CameraTracker
 from bdgs_ros.tracking.shutter import straightened
 
@@ -115,9 +115,20 @@ class BdgsSlam:
         self.mapper.reset()
 
 
-def take_keyframe(back_end: BackEnd, mapper: Mapper, keyframe: Keyframe) -> ModelView | None:
+def take_keyframe(
+    back_end: BackEnd, mapper: Mapper, keyframe: Keyframe, early: Answer | None = None
+) -> ModelView | None:
     """
     Make a keyframe agree with the earlier ones, then take it into the map.
+
+    Parameters
+    ----------
+    back_end, mapper : BackEnd, Mapper
+        They are changed.
+    keyframe : Keyframe
+        As tracking gave it.
+    early : callable, optional
+        Called with a first view, long before the optimised one is there.
 
     Returns
     -------
@@ -133,4 +144,4 @@ def take_keyframe(back_end: BackEnd, mapper: Mapper, keyframe: Keyframe) -> Mode
     mapper.readout_s = back_end.readout_s
     corrected = transforms[stamp_ns] @ tracked if transforms else tracked
     frame, p_dynamic = straightened(keyframe.frame, keyframe.p_dynamic, back_end.sweep(stamp_ns))
-    return mapper.process(Keyframe(frame, corrected, p_dynamic), tracked)
+    return mapper.process(Keyframe(frame, corrected, p_dynamic), tracked, early)

@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 
 from bdgs_ros.back_end.calibration import BENDS, SIZE, Calibration, Known
 from bdgs_ros.back_end.pair import PairFactor
-from bdgs_ros.core import se3
 from bdgs_ros.core.config.back_end import BundleConfig
 from bdgs_ros.core.types import Pose
 
@@ -29,6 +28,7 @@ _SETTLED = 1e-4  # m and rad
 _TOLERANCE = 9.0  # medians of the pairs' errors beyond which a pair counts less
 _NARROWER = 10.0  # what is tolerated, from round to round
 _FIXED = 1e8
+_SMALL_RAD = 1e-4  # below, 1 - cos loses its digits
 
 
 @dataclass(frozen=True)
@@ -97,15 +97,13 @@ def solve(
         system.add_known(sure, vector - known.calibration.vector)
         step = system.solve()
         moves = step[: 6 * len(world)].reshape(-1, 6)
-        world = np.array([se3.exp(move) @ T for move, T in zip(moves, world, strict=True)])
+        world = _exponentials(moves) @ world
         vector = vector + step[6 * len(world) :]
         if wide == 1.0 and np.abs(step).max() < _SETTLED:
             break
-    return Solution(
-        [se3.orthonormalise(T) for T in world],
-        Calibration.of_vector(np.asarray(vector)),
-        system.last_sigma(),
-    )
+    u, _, vt = np.linalg.svd(world[:, :3, :3])  # after many products: back onto SO(3)
+    world[:, :3, :3] = u @ vt
+    return Solution(list(world), Calibration.of_vector(np.asarray(vector)), system.last_sigma())
 
 
 @dataclass(frozen=True)
@@ -239,6 +237,19 @@ class _System:
         matrix[size:, size:] = self._common
         triangle, is_lower = cho_factor(matrix)
         return np.asarray(triangle), bool(is_lower)
+
+
+def _exponentials(xi: Array) -> Array:
+    """Return `se3.exp` of tangent vectors, [N, 6], as motions, [N, 4, 4]."""
+    rho, phi = xi[:, :3], xi[:, 3:]
+    angle = np.maximum(np.linalg.norm(phi, axis=1, keepdims=True), _SMALL_RAD)
+    once = np.cross(phi, rho)
+    T = np.zeros((len(xi), 4, 4))
+    T[:, :3, :3] = Rotation.from_rotvec(phi).as_matrix()
+    T[:, :3, 3] = rho + (1 - np.cos(angle)) / angle**2 * once
+    T[:, :3, 3] += (angle - np.sin(angle)) / angle**3 * np.cross(phi, once)
+    T[:, 3, 3] = 1
+    return T
 
 
 def _inverses(T: Array) -> Array:

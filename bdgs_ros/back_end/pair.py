@@ -188,7 +188,7 @@ def linearise(
 
 def _moved(points: Array, inverse: Array, twist: Array, rows: Array) -> Array:
     """Return how far points, times inverse depth, move per second of readout, [N, 3]."""
-    speed = np.cross(twist[3:], points) + inverse[:, None] * twist[:3]
+    speed = points @ se3.hat(twist[3:]).T + inverse[:, None] * twist[:3]
     return np.asarray(rows[:, None] * speed)
 
 

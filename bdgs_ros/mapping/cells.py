@@ -82,9 +82,8 @@ def lost_detail(color: Array, size: int) -> Array:
     padded = _pad(color, size)
     small = cv2.resize(padded, (columns, rows), interpolation=cv2.INTER_AREA)
     back = cv2.resize(small, padded.shape[1::-1], interpolation=cv2.INTER_LINEAR)
-    lost = ((padded - back) ** 2).mean(axis=2)
-    mean = cv2.resize(lost, (columns, rows), interpolation=cv2.INTER_AREA)
-    return np.asarray(np.sqrt(mean), np.float32)
+    mean = cv2.resize((padded - back) ** 2, (columns, rows), interpolation=cv2.INTER_AREA)
+    return np.sqrt(np.mean(mean, axis=2, dtype=np.float32))
 
 
 def average(image: Array, cells: Cells) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,7 +39,9 @@ def fit_exposure(static: Rendered, level: Level) -> Array | None:
     """
     color = level.color
     known = level.static & (static.silhouette > _OPAQUE)
-    known &= (color.min(axis=2) > _DARK) & (color.max(axis=2) < _SATURATED)
+    channels = cv2.split(color)  # numpy is slow over a last axis of three
+    known &= np.minimum.reduce(channels) > _DARK
+    known &= np.maximum.reduce(channels) < _SATURATED
     if known.sum() < _MIN_PIXELS:
         return None
     shown = static.color[known] / static.silhouette[known][:, None]

@@ -148,23 +148,22 @@ def _sample_depth(depth_m: DepthImage, shape: tuple[int, int]) -> DepthImage:
     A single one of them would do for edges, but is off by half a pixel on slanted surfaces.
     """
     blocks = _blocks(depth_m, shape)
-    ordered = np.sort(blocks, axis=2)
-    invalid = (ordered == 0).sum(axis=2)
-    valid = blocks.shape[2] - invalid
-    middle = np.minimum(invalid + np.maximum(valid - 1, 0) // 2, blocks.shape[2] - 1)
-    median = np.take_along_axis(ordered, middle[..., None], 2)
+    ordered = np.sort(blocks, axis=0)
+    valid = np.count_nonzero(blocks, axis=0)
+    middle = len(blocks) - valid + np.maximum(valid - 1, 0) // 2
+    median = np.take_along_axis(ordered, np.minimum(middle, len(blocks) - 1)[None], 0)[0]
     same = (blocks > 0) & (np.abs(blocks - median) <= _SAME_SURFACE * median)
-    count = np.maximum(same.sum(axis=2), 1)
-    return np.asarray((blocks * same).sum(axis=2) / count, np.float32)
+    count = np.maximum(np.count_nonzero(same, axis=0), 1)
+    return np.asarray((blocks * same).sum(axis=0) / count, np.float32)
 
 
 def _blocks(depth_m: DepthImage, shape: tuple[int, int]) -> DepthImage:
-    """Return the pixels that fall into each pixel of the smaller image, [H, W, B]."""
+    """Return the pixels that fall into each pixel of the smaller image, [B, H, W]."""
     rows = depth_m.shape[0] // shape[0]
     columns = depth_m.shape[1] // shape[1]
     blocks = depth_m[: shape[0] * rows, : shape[1] * columns]
-    blocks = blocks.reshape(shape[0], rows, shape[1], columns).transpose(0, 2, 1, 3)
-    return np.ascontiguousarray(blocks).reshape(*shape, rows * columns)
+    blocks = blocks.reshape(shape[0], rows, shape[1], columns).transpose(1, 3, 0, 2)
+    return blocks.reshape(rows * columns, *shape)
 
 
 def build_levels(

@@ -49,6 +49,7 @@ from bdgs_ros.mapping.surface import fit_surface
 from bdgs_ros.mapping.vignette import Photo, Vignette
 
 Mask = NDArray[np.bool_]
+Answer = Callable[[ModelView], None]
 
 _PHOTOS = 4  # so many earlier keyframes are compared with
 _MIN_BLOB_SHARE = 0.002  # of the image; smaller things in front of the map are noise
@@ -75,6 +76,7 @@ class Mapper:
     ) -> None:
         self._config = mapping
         self._belief = belief
+        self._hurried = hurried
         self._optimiser = Optimiser(mapping, hurried)
         self.inference = Inference(belief)
         """May be replaced by one that keeps a record."""
@@ -99,7 +101,9 @@ class Mapper:
         self._index_of: dict[int, int] = {}  # of this run's keyframes, by stamp
         self._rng = np.random.default_rng(self._config.seed)
 
-    def process(self, keyframe: Keyframe, tracked: Pose | None = None) -> ModelView | None:
+    def process(
+        self, keyframe: Keyframe, tracked: Pose | None = None, early: Answer | None = None
+    ) -> ModelView | None:
         """
         Take a keyframe into the map.
 
@@ -109,11 +113,15 @@ class Mapper:
             Frame, pose and dynamic prior.
         tracked : ndarray, shape (4, 4), optional
             Pose that tracking gave it, where the back end has corrected it since.
+        early : callable, optional
+            Called with the view as it is before optimisation, which takes most of the time. If
+            the next keyframe waits after that, it has to do.
 
         Returns
         -------
         view : ModelView or None
-            The static map at the keyframe's pose; None with `mapping.enabled` off.
+            The static map at the keyframe's pose; None with `mapping.enabled` off, or if the
+            early one has to do.
 
         """
         if not self._config.enabled:
@@ -121,8 +129,7 @@ class Mapper:
         fine = shrink(keyframe, self._config.width)
         if self.frozen:
             return self.view(fine.frame.stamp_ns, fine.T_world_camera, fine.frame.camera)
-        fine = self._straighten(fine)
-        small = shrink(fine, self._config.growth_width)
+        fine, small = self._straighten(fine, shrink(fine, self._config.growth_width))
         agree = self._infer(small)
         static = self._look(small, agree)
         in_front = self._in_front(small, static)
@@ -133,20 +140,30 @@ class Mapper:
         companions = self._companions()
         for companion in companions:
             self.depth_bend.renew(companion)
+        if early is not None:
+            early(self._answer(current))
         self._optimiser.run(self.map, current, companions)
         self._thin()
-        self.history.publish(current)
-        return self.view(
-            current.stamp_ns, current.T_world_camera, fine.frame.camera, current.exposure
-        )
+        if early is not None and self._hurried():
+            return None
+        return self._answer(current)
 
-    def _straighten(self, keyframe: Keyframe) -> Keyframe:
+    def _answer(self, current: MapKeyframe) -> ModelView:
+        """Render what tracking gets, and note that it does."""
+        self.history.publish(current)
+        pose, camera = current.T_world_camera, current.levels[0].camera
+        return self.view(current.stamp_ns, pose, camera, current.exposure)
+
+    def _straighten(self, fine: Keyframe, small: Keyframe) -> tuple[Keyframe, Keyframe]:
         """Learn the bend of the depth sensor, and take out of the depth what is known of it."""
-        frame = keyframe.frame
-        measured = RangeImage.of(shrink(keyframe, self._config.growth_width))
+        measured = RangeImage.of(small)
         for earlier in self._ranges:
             self.depth_bend.learn(measured, earlier)
         self._ranges = [*self._ranges, measured][-_PHOTOS:]
+        return self._unbent(fine), self._unbent(small)
+
+    def _unbent(self, keyframe: Keyframe) -> Keyframe:
+        frame = keyframe.frame
         depth_m = self.depth_bend.correct(frame.depth_m, frame.camera)
         return replace(keyframe, frame=replace(frame, depth_m=depth_m))
 
@@ -276,6 +293,8 @@ class Mapper:
         surface = fit_surface(level.depth_m, usable, level.camera, config.normal_px, sigma)
 
         def grow(pixels: Mask, belief: float) -> None:
+            if not pixels.any():
+                return
             new = lift(current, level, surface, pixels, belief, config)
             self.map.append(new, config.opacity, current.index)
             rows = np.arange(len(self.map) - len(new.means), len(self.map))

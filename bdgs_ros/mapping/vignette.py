@@ -98,11 +98,12 @@ class Photo:
     @classmethod
     def of(cls, image: RgbdImage, T_world_camera: Pose) -> Photo:
         """Take an image apart; what moves, is too dark or too bright is not used."""
-        color = image.image
-        usable = (color.min(axis=2) > 255 * _DARK) & (color.max(axis=2) < 255 * _SATURATED)
+        channels = cv2.split(image.image)  # numpy is slow over a last axis of three
+        usable = np.minimum.reduce(channels) > 255 * _DARK
+        usable &= np.maximum.reduce(channels) < 255 * _SATURATED
         return cls(
             image.camera,
-            color.mean(axis=2, dtype=np.float32) / np.float32(255),
+            np.add.reduce(channels, dtype=np.float32) / np.float32(3 * 255),
             image.depth_m,
             image.static & usable & (image.depth_m > 0),
             T_world_camera,
@@ -111,9 +112,11 @@ class Photo:
 
 @lru_cache(maxsize=16)
 def _falloff(camera: PinholeCamera, coefficients: tuple[float, float]) -> Array:
-    rho2 = (camera.rays()[..., :2] ** 2).sum(axis=2)
-    exponent = np.clip(coefficients[0] * rho2 + coefficients[1] * rho2**2, _DARKEST, _BRIGHTEST)
-    image: Array = np.exp(exponent).astype(np.float32)
+    x = (np.arange(camera.width) - camera.cx) / camera.fx
+    y = (np.arange(camera.height) - camera.cy) / camera.fy
+    rho2 = ((y * y)[:, None] + x * x).astype(np.float32)
+    a, b = (np.float32(value) for value in coefficients)
+    image: Array = np.exp(np.clip((a + b * rho2) * rho2, _DARKEST, _BRIGHTEST))
     image.setflags(write=False)
     return image
 
@@ -158,7 +161,8 @@ def _correspondences(one: Photo, other: Photo) -> tuple[Matrix, NDArray[np.int64
     index = np.argwhere(one.usable)
     index = index[:: 1 + len(index) // _MAX_PIXELS]
     T_other_one = np.linalg.inv(other.T_world_camera) @ one.T_world_camera
-    points = one.camera.unproject(one.depth_m)[tuple(index.T)] @ T_other_one[:3, :3].T
+    at = tuple(index.T)
+    points = one.depth_m[at][:, None] * one.camera.rays()[at] @ T_other_one[:3, :3].T
     points = points + T_other_one[:3, 3]
     front = points[:, 2] > 0.1
     points, index = points[front], index[front]

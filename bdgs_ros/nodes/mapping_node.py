@@ -181,16 +181,19 @@ class MappingNode(GraphNode):
                 view = self._map(keyframe)
         except BdgsError as error:
             self._health.error(error)
-        finally:  # an empty answer tells tracking not to wait
-            self._models.publish(stamp_ns, view)
+        finally:  # an empty answer tells tracking, which waits in lockstep, not to
+            if view is not None or self._config.lockstep:
+                self._models.publish(stamp_ns, view)
         self._publish_keyframes(stamp_ns)
         self._health.counts['gaussians'] = len(self._mapper.map)
         self._health.counts['keyframes_dropped'] = self._worker.dropped
 
     def _map(self, keyframe: Keyframe) -> ModelView | None:
         with self._health.timed('mapping'), self._lock:
-            self._observe_until(keyframe.frame.stamp_ns)
-            view = take_keyframe(self._back_end, self._mapper, keyframe)
+            stamp_ns = keyframe.frame.stamp_ns
+            self._observe_until(stamp_ns)
+            early = None if self._config.lockstep else partial(self._models.publish, stamp_ns)
+            view = take_keyframe(self._back_end, self._mapper, keyframe, early)
             self._version += not self._mapper.frozen
         self._health.counts['keyframes'] += 1
         return view

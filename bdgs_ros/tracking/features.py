@@ -102,8 +102,11 @@ def match(a: Features, b: Features, config: FeatureConfig) -> NDArray[np.intp]:
     if min(len(a), len(b)) < _NEIGHBOURS:
         return np.zeros((0, 2), np.intp)
     ahead, clear = _nearest(a.descriptors, b.descriptors, config)
-    back, _ = _nearest(b.descriptors, a.descriptors, config)
-    rows = np.flatnonzero(clear & (back[ahead] == np.arange(len(a))))
+    rows = np.flatnonzero(clear)
+    if not len(rows):
+        return np.zeros((0, 2), np.intp)
+    back, _ = _nearest(b.descriptors[ahead[rows]], a.descriptors, config)
+    rows = rows[back == rows]
     return np.stack([rows, ahead[rows]], axis=1)
 
 

@@ -18,6 +18,7 @@ from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.types import ProbabilityImage, RgbdFrame
 
 _LEAST_PX = 0.1  # smaller bends are left alone
+_KNOT_PX = 16
 _PASSES = 3  # a pixel's row is known only once the pixel is
 
 
@@ -56,13 +57,35 @@ def straightened(
 def _where_to_look(
     camera: PinholeCamera, turn: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the pixel (u, v) of the rolling image for every pixel, each of shape (H, W)."""
-    rays = camera.rays().astype(np.float64)
-    v = np.broadcast_to(np.arange(camera.height)[:, None], camera.shape).astype(np.float64)
-    u = v
+    """
+    Return the pixel (u, v) of the rolling image for every pixel, each of shape (H, W).
+
+    How far it lies from the pixel itself varies slowly, and is interpolated between knots.
+    """
+    columns, rows = _knots(camera.width), _knots(camera.height)
+    x = (columns - camera.cx) / camera.fx
+    y = ((rows - camera.cy) / camera.fy)[:, None]
+    v = rows[:, None]
     for _ in range(_PASSES):
-        share = np.clip((v + 0.5) / camera.height, 0, 1) - 0.5
-        seen = rays - share[..., None] * np.cross(turn, rays)
-        u = camera.fx * seen[..., 0] / seen[..., 2] + camera.cx
-        v = camera.fy * seen[..., 1] / seen[..., 2] + camera.cy
-    return u.astype(np.float32), v.astype(np.float32)
+        share = (v + 0.5) / camera.height - 0.5
+        z = 1 - share * (turn[0] * y - turn[1] * x)
+        u = camera.fx * (x - share * (turn[1] - turn[2] * y)) / z + camera.cx
+        v = camera.fy * (y - share * (turn[2] * x - turn[0])) / z + camera.cy
+    down, across = _interpolation(rows, camera.height), _interpolation(columns, camera.width)
+    u_off, v_off = (
+        down @ off.astype(np.float32) @ across.T for off in (u - columns, v - rows[:, None])
+    )
+    u_off += np.arange(camera.width, dtype=np.float32)
+    v_off += np.arange(camera.height, dtype=np.float32)[:, None]
+    return u_off, v_off
+
+
+def _knots(length: int) -> NDArray[np.float64]:
+    """Return pixels from the first to the last, about `_KNOT_PX` apart."""
+    return np.linspace(0, length - 1, 2 + (length - 1) // _KNOT_PX)
+
+
+def _interpolation(knots: NDArray[np.float64], length: int) -> NDArray[np.float32]:
+    """Return the matrix that interpolates values at knots linearly at all pixels, [L, K]."""
+    pixels = np.arange(length)
+    return np.array([np.interp(pixels, knots, one) for one in np.eye(len(knots))], np.float32).T

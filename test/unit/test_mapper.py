@@ -73,6 +73,27 @@ def test_the_view_for_tracking_has_the_pose_and_stamp_of_its_keyframe() -> None:
     assert abs(float(np.median(view.depth_m[view.depth_m > 0])) - WALL_Z) < 0.05
 
 
+def test_an_early_view_comes_before_optimisation() -> None:
+    mapper = Mapper(CONFIG.mapping, CONFIG.belief)
+    early = []
+    for i, T in enumerate(poses(2)):
+        final = mapper.process(Keyframe(wall(i * SECOND, T), T, no_prior()), early=early.append)
+    assert final is not None
+    assert [view.stamp_ns for view in early] == [0, SECOND]
+    np.testing.assert_array_equal(early[1].T_world_camera, poses(2)[1])
+    assert (final.color != early[1].color).any()
+
+
+def test_an_early_view_has_to_do_where_the_next_keyframe_waits() -> None:
+    mapper = Mapper(CONFIG.mapping, CONFIG.belief, hurried=lambda: True)
+    early = []
+    assert mapper.process(Keyframe(wall(0, poses(1)[0]), poses(1)[0], no_prior())) is not None
+    T = poses(2)[1]
+    assert mapper.process(Keyframe(wall(SECOND, T), T, no_prior()), early=early.append) is None
+    assert len(early) == 1
+    assert len(mapper.map)
+
+
 def test_labelled_people_leave_no_gaussians() -> None:
     mapper = Mapper(CONFIG.mapping, CONFIG.belief)
     frame, where = box_in_front(wall(0, np.eye(4)))

@@ -166,7 +166,7 @@ class MappingConfig:
         16, 'iterations at the finest level where the residual says enough', low=0, high=1000
     )
     hurried_fine: int = param(
-        4, 'iterations there while the next keyframe waits (realtime)', low=0, high=1000
+        0, 'iterations there while the next keyframe waits (realtime)', low=0, high=1000
     )
     window: int = param(8, 'newest keyframes in every optimisation', low=1, high=64)
     keyframes: int = param(
