@@ -259,6 +259,8 @@ class CameraTracker:
 
     def _sweep(self, stamp_ns: int, coarse: Estimate) -> NDArray[np.float64]:
         """Return the motion during the readout of a rolling shutter, with this frame's own."""
+        if not self._readout_s:  # nothing to find out: spare the filter an update
+            return np.zeros(6)
         pose, covariance = coarse.T_world_camera, coarse.quality.covariance
         return self._readout_s * self._motion.velocity_with(stamp_ns, pose, covariance)
 
