@@ -289,11 +289,7 @@ def _are_near(T: Pose) -> bool:
 
 def _most_redundant(poses: Sequence[Pose], window: int) -> tuple[int, int]:
     """Return which keyframe is nearest to another, and to which; not the first, not the window."""
-    centres = np.array([pose[:3, 3] for pose in poses])
-    axes = np.array([pose[:3, 2] for pose in poses])
-    apart = np.linalg.norm(centres[:, None] - centres, axis=2)
-    distance = apart + _METRES_PER_RADIAN * np.arccos(np.clip(axes @ axes.T, -1, 1))
-    np.fill_diagonal(distance, np.inf)
+    distance = se3.view_distances(poses, _METRES_PER_RADIAN)
     nearest = distance[1:-window].min(axis=1)
     gone = 1 + int(np.argmin(nearest))
     return gone, int(np.argmin(distance[gone]))

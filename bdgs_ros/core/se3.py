@@ -7,6 +7,8 @@ rotation vector in radians. The exponential follows Sola et al., "A micro Lie th
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -89,3 +91,28 @@ def orthonormalise(T_a_b: Matrix) -> Matrix:
     """Project the rotation part back onto SO(3) after many products."""
     u, _, vt = np.linalg.svd(T_a_b[:3, :3])
     return from_rotation_translation(u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt, T_a_b[:3, 3])
+
+
+def view_distances(poses: Sequence[Matrix], metres_per_radian: float) -> Matrix:
+    """
+    Say how differently cameras see: the way between them, and the turn of their optical axes.
+
+    Parameters
+    ----------
+    poses : sequence of ndarray, shape (4, 4)
+        `T_world_camera` of K cameras.
+    metres_per_radian : float
+        How far a camera has to go for what it sees to change as much as by a turn of a radian.
+
+    Returns
+    -------
+    distances : ndarray, shape (K, K)
+        Metres; infinite on the diagonal, so that no camera is the nearest to itself.
+
+    """
+    centres = np.array([pose[:3, 3] for pose in poses])
+    axes = np.array([pose[:3, 2] for pose in poses])
+    apart = np.linalg.norm(centres[:, None] - centres, axis=2)
+    distances = apart + metres_per_radian * np.arccos(np.clip(axes @ axes.T, -1, 1))
+    np.fill_diagonal(distances, np.inf)
+    return np.asarray(distances)

@@ -213,12 +213,8 @@ def most_redundant(keyframes: Sequence[MapKeyframe]) -> MapKeyframe:
     """Return the keyframe that another one, from about the same place, can best stand in for."""
     if len(keyframes) == 1:
         return keyframes[0]
-    positions = np.array([k.T_world_camera[:3, 3] for k in keyframes])
-    forward = np.array([k.T_world_camera[:3, 2] for k in keyframes])
     # A metre apart and a radian turned count alike: either changes what is seen about as much.
-    apart = np.linalg.norm(positions[:, None] - positions[None], axis=2)
-    turned = np.arccos(np.clip(forward @ forward.T, -1, 1))
-    distance = apart + turned + np.diag(np.full(len(keyframes), np.inf))
+    distance = se3.view_distances([k.T_world_camera for k in keyframes], metres_per_radian=1.0)
     return keyframes[int(distance.min(axis=1).argmin())]
 
 

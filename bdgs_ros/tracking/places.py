@@ -193,10 +193,5 @@ def _shrink(
 
 def _most_redundant(places: list[Place]) -> int:
     """Return which place is nearest to another one; the newest is never it."""
-    centres = np.array([p.T_world_camera[:3, 3] for p in places])
-    axes = np.array([p.T_world_camera[:3, 2] for p in places])
-    apart = np.linalg.norm(centres[:, None] - centres, axis=2)
-    turned = np.arccos(np.clip(axes @ axes.T, -1, 1))
-    distance = apart + _METRES_PER_RADIAN * turned
-    np.fill_diagonal(distance, np.inf)
+    distance = se3.view_distances([p.T_world_camera for p in places], _METRES_PER_RADIAN)
     return int(np.argmin(distance[:-1].min(axis=1)))

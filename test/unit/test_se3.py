@@ -57,3 +57,12 @@ def test_orthonormalise_restores_a_rotation() -> None:
     R = se3.orthonormalise(noisy)[:3, :3]
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(R, T[:3, :3], atol=1e-3)
+
+
+def test_view_distances_join_way_and_turn() -> None:
+    turn = np.array([0.0, 0.0, 0.0, 0.0, 0.5, 0.0])
+    poses = [np.eye(4), se3.exp(np.array([3.0, 0, 4.0, 0, 0, 0])), se3.exp(turn)]
+    distances = se3.view_distances(poses, metres_per_radian=2.0)
+    assert np.all(np.isinf(np.diag(distances)))
+    assert np.allclose(distances, distances.T)
+    assert np.allclose(distances[0, 1:], [5.0, 1.0])
