@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bdgs_ros.core.bend import BENDS
+
 Array = NDArray[np.float64]
 
-BENDS = 5
 SIZE = BENDS + 1
-_HALF_WIDTH = 0.5  # tangent at which the functions are about 1
 
 
 @dataclass(frozen=True)
@@ -51,24 +51,3 @@ class Known:
 
     calibration: Calibration
     readout_sigma_s: float
-
-
-def bend_functions(tangents: Array) -> Array:
-    """
-    Return the functions that a bend is made of, at viewing rays.
-
-    The same as in `bdgs_ros.mapping.depth_bend`, which learns from depth alone; a constant is
-    left out because it would scale the world.
-
-    Parameters
-    ----------
-    tangents : ndarray, shape (N, 2)
-        (x, y) of rays with z = 1.
-
-    Returns
-    -------
-    functions : ndarray, shape (N, 5)
-
-    """
-    x, y = tangents.T / _HALF_WIDTH
-    return np.stack([x, y, x * x, x * y, y * y], axis=1)

@@ -68,11 +68,6 @@ class View:
             twist,
         )
 
-    def tangents(self, pixels: Array) -> Array:
-        """Return (x, y) of the viewing rays with z = 1 through pixels, shape (N, 2)."""
-        camera = self.camera
-        return (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-
     def at(self, pixels: Array) -> tuple[Array, Array]:
         """Return inverse depth (0 where unknown) and P(static) at pixels, each of shape (N,)."""
         height, width = self.depth_m.shape
@@ -179,9 +174,9 @@ def _shared(corners: Corners, other: View, rows: NDArray[np.intp], there: Array)
     height = other.camera.height
     inverse_other, p_static_other = other.at(there)
     return Shared(
-        corners.view.tangents(corners.pixels[rows]),
+        corners.view.camera.tangents(corners.pixels[rows]),
         corners.inverse_depth[rows],
-        other.tangents(there),
+        other.camera.tangents(there),
         inverse_other,
         np.stack([corners.pixels[rows, 1], there[:, 1]], axis=1) / height - 0.5,
         corners.p_static[rows] * p_static_other,
@@ -190,7 +185,7 @@ def _shared(corners: Corners, other: View, rows: NDArray[np.intp], there: Array)
 
 def _predict(corners: Corners, other: View, T_other_one: Pose) -> tuple[Array, NDArray[np.bool_]]:
     """Return where corners should be, shape (N, 2), and whether that is inside, shape (N,)."""
-    tangents = corners.view.tangents(corners.pixels)
+    tangents = corners.view.camera.tangents(corners.pixels)
     rays = np.column_stack([tangents, np.ones(len(tangents))])
     points = rays / corners.inverse_depth[:, None] @ T_other_one[:3, :3].T + T_other_one[:3, 3]
     ahead = points[:, 2] > _LEAST_M / 2

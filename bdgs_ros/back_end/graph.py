@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
-from bdgs_ros.back_end.calibration import BENDS, SIZE, Calibration, Known
+from bdgs_ros.back_end.calibration import SIZE, Calibration, Known
 from bdgs_ros.back_end.pair import PairFactor
+from bdgs_ros.core.bend import BENDS
 from bdgs_ros.core.config.back_end import BundleConfig
 from bdgs_ros.core.types import Pose
 

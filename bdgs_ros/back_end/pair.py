@@ -18,9 +18,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bdgs_ros.back_end.calibration import BENDS, SIZE, Calibration, bend_functions
+from bdgs_ros.back_end.calibration import SIZE, Calibration
 from bdgs_ros.back_end.corners import Shared
 from bdgs_ros.core import se3
+from bdgs_ros.core.bend import BENDS, bend_functions
 from bdgs_ros.core.config.back_end import BundleConfig
 from bdgs_ros.core.types import Pose
 

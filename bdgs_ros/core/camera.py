@@ -88,6 +88,10 @@ class PinholeCamera:
             raise ValueError(f'depth_m: expected shape {self.shape}, received {depth_m.shape}')
         return self.rays() * depth_m[..., None]
 
+    def tangents(self, pixels: NDArray[np.floating | np.integer]) -> NDArray[np.float64]:
+        """Return (x, y) of the viewing rays with z = 1 through pixels (u, v), shape (N, 2)."""
+        return (pixels - [self.cx, self.cy]) / [self.fx, self.fy]
+
     def project(self, points_camera: NDArray[np.floating]) -> NDArray[np.float64]:
         """Project points, shape (N, 3), with z > 0 to image coordinates (u, v), shape (N, 2)."""
         z = points_camera[:, 2]

@@ -7,7 +7,7 @@ themselves carry nothing of it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bdgs_ros.core import se3
-from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.errors import DatasetError
 from bdgs_ros.core.types import RgbdFrame, StampedPose, Trajectory
-from bdgs_ros.data.sequence import Sequence
+from bdgs_ros.data.sequence import RearrangedSequence, Sequence
 
 Cover = Callable[[RgbdFrame, np.random.Generator], RgbdFrame]
 
@@ -118,7 +117,7 @@ def poses_at(truth: Trajectory, stamps_ns: NDArray[np.int64]) -> list[NDArray[np
     return [truth.poses[i].T_world_camera for i in nearest]
 
 
-class FaultySequence:
+class FaultySequence(RearrangedSequence):
     """
     A recording with a covered view, or with a jump, at camera rate.
 
@@ -145,28 +144,13 @@ class FaultySequence:
         cover: Cover = black,
         seed: int = 0,
     ) -> None:
-        self._sequence = sequence
-        self._indices = indices
-        self.covered = covered
-        """Places at which the view is covered."""
-        self._cover, self._seed = cover, seed
         own = np.asarray(sequence.stamps_ns, np.int64)
         usual = int(np.median(np.diff(own)))
         steps = np.where(np.diff(indices) == 1, np.diff(own[indices]), usual)
-        self.stamps_ns: NDArray[np.int64] = own[indices[0]] + np.concatenate(
-            [[0], np.cumsum(steps)]
-        )
-        self.unpaired_color: tuple[str, ...] = ()
-
-    @property
-    def name(self) -> str:
-        """What the recording is called."""
-        return self._sequence.name
-
-    @property
-    def camera(self) -> PinholeCamera:
-        """The camera with its distortion, as recorded."""
-        return self._sequence.camera
+        super().__init__(sequence, indices, steps)
+        self.covered = covered
+        """Places at which the view is covered."""
+        self._cover, self._seed = cover, seed
 
     @property
     def ground_truth(self) -> Trajectory | None:
@@ -178,22 +162,13 @@ class FaultySequence:
         stamped = zip(self.stamps_ns, poses, strict=True)
         return Trajectory(tuple(StampedPose(int(s), T) for s, T in stamped))
 
-    def __len__(self) -> int:
-        """Return the number of frames."""
-        return len(self._indices)
-
     def __getitem__(self, index: int) -> RgbdFrame:
         """Read one frame; negative indices count from the end."""
         place = range(len(self))[index]
-        frame = self._sequence[int(self._indices[place])]
-        frame = replace(frame, stamp_ns=int(self.stamps_ns[place]))
+        frame = super().__getitem__(place)
         if place not in self.covered:
             return frame
         return self._cover(frame, np.random.default_rng([self._seed, place]))
-
-    def __iter__(self) -> Iterator[RgbdFrame]:
-        """Read all frames in order."""
-        return (self[index] for index in range(len(self)))
 
 
 def covered(

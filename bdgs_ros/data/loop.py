@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.errors import DatasetError
-from bdgs_ros.core.types import ColorImage, DepthImage, RgbdFrame, StampedPose, Trajectory
-from bdgs_ros.data.sequence import Sequence
+from bdgs_ros.core.types import ColorImage, DepthImage, StampedPose, Trajectory
+from bdgs_ros.data.sequence import RearrangedSequence, Sequence
 
 
 def forth_and_back(available: int, count: int) -> NDArray[np.int64]:
@@ -26,7 +24,7 @@ def forth_and_back(available: int, count: int) -> NDArray[np.int64]:
     return np.where(phase < available, phase, period - phase).astype(np.int64)
 
 
-class LoopedSequence:
+class LoopedSequence(RearrangedSequence):
     """
     A sequence forth and back until it has `count` frames, with stamps that only grow.
 
@@ -53,22 +51,9 @@ class LoopedSequence:
                 f"'{sequence.name}' with {len(sequence)} frames cannot be looped to {count}; "
                 'at least 2 frames and a count of 1 are needed'
             )
-        self._sequence = sequence
-        self._indices = forth_and_back(len(sequence), count)
+        indices = forth_and_back(len(sequence), count)
         own = np.asarray(sequence.stamps_ns, np.int64)
-        steps = np.abs(np.diff(own[self._indices]))
-        self.stamps_ns: NDArray[np.int64] = own[0] + np.concatenate([[0], np.cumsum(steps)])
-        self.unpaired_color: tuple[str, ...] = ()
-
-    @property
-    def name(self) -> str:
-        """What the recording is called."""
-        return self._sequence.name
-
-    @property
-    def camera(self) -> PinholeCamera:
-        """The camera with its distortion, as recorded."""
-        return self._sequence.camera
+        super().__init__(sequence, indices, np.abs(np.diff(own[indices])))
 
     @property
     def ground_truth(self) -> Trajectory | None:
@@ -99,19 +84,6 @@ class LoopedSequence:
         """Return the recorded stamp of the frame nearest to a stamp of the loop."""
         place = int(np.argmin(np.abs(self.stamps_ns - stamp_ns)))
         return int(self._sequence.stamps_ns[self._indices[place]])
-
-    def __len__(self) -> int:
-        """Return the number of frames."""
-        return len(self._indices)
-
-    def __getitem__(self, index: int) -> RgbdFrame:
-        """Read one frame; negative indices count from the end."""
-        frame = self._sequence[int(self._indices[index])]
-        return replace(frame, stamp_ns=int(self.stamps_ns[index]))
-
-    def __iter__(self) -> Iterator[RgbdFrame]:
-        """Read all frames in order."""
-        return (self[index] for index in range(len(self)))
 
 
 class _Truth(Protocol):

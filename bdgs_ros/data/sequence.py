@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -89,6 +90,54 @@ class Sequence(Protocol):
 
     def __iter__(self) -> Iterator[RgbdFrame]:
         """Read all frames in order."""
+
+
+class RearrangedSequence:
+    """
+    The frames of another sequence in another order, with stamps of their own.
+
+    Parameters
+    ----------
+    sequence : Sequence
+        Where the frames come from.
+    indices : ndarray, shape (N,), int
+        Which of its frames are shown, in this order.
+    steps_ns : ndarray, shape (N - 1,), int
+        Time from each frame to the next; the first has the stamp it was recorded with.
+
+    """
+
+    def __init__(
+        self, sequence: Sequence, indices: NDArray[np.int64], steps_ns: NDArray[np.int64]
+    ) -> None:
+        self._sequence = sequence
+        self._indices = indices
+        first_ns = int(sequence.stamps_ns[indices[0]])
+        self.stamps_ns: NDArray[np.int64] = first_ns + np.concatenate([[0], np.cumsum(steps_ns)])
+        self.unpaired_color: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """What the recording is called."""
+        return self._sequence.name
+
+    @property
+    def camera(self) -> PinholeCamera:
+        """The camera with its distortion, as recorded."""
+        return self._sequence.camera
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self._indices)
+
+    def __getitem__(self, index: int) -> RgbdFrame:
+        """Read one frame; negative indices count from the end."""
+        frame = self._sequence[int(self._indices[index])]
+        return replace(frame, stamp_ns=int(self.stamps_ns[index]))
+
+    def __iter__(self) -> Iterator[RgbdFrame]:
+        """Read all frames in order."""
+        return (self[index] for index in range(len(self)))
 
 
 class RecordedSequence:

@@ -8,22 +8,22 @@ is fixed to the camera, and it is one of disparity, so one of inverse depth:
 
     1 / z_true = 1 / z + sum_k c_k q_k(x, y)        x, y: tangents of the viewing ray
 
-with few smooth functions `q_k`. No calibration target is needed, as in Teichman, Miller and
-Thrun, "Unsupervised intrinsic calibration of depth sensors via SLAM" (RSS 2013), whose table of
-factors per pixel and distance needs minutes of data; ours has a handful of numbers. A constant is
-left out of `q`: pairs of views say little about it, and it would scale the map.
+with few smooth functions `q_k` (`bdgs_ros.core.bend`). No calibration target is needed, as in
+Teichman, Miller and Thrun, "Unsupervised intrinsic calibration of depth sensors via SLAM" (RSS
+2013), whose table of factors per pixel and distance needs minutes of data; ours has a handful of
+numbers.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from bdgs_ros.core.bend import BENDS, bend_functions, inverse_depth_bend
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.types import DepthImage, Keyframe, Pose
 from bdgs_ros.mapping.keyframes import MapKeyframe, is_dynamic, shrink
@@ -34,7 +34,6 @@ Matrix = NDArray[np.float64]
 
 _ROUNDS = 4  # of reweighting
 _WIDTH = 80  # of the images that are compared, px
-_HALF_WIDTH = 0.5  # tangent at which the functions are about 1
 _NOISE = 0.004  # of inverse depth, 1/m
 _TOLERANCE = 3.0  # noises beyond which differences count less
 _SAME_SURFACE = 0.03  # 1/m
@@ -47,27 +46,20 @@ _MIN_SLANT = 0.2  # of a surface: nothing is learned from those seen under a sma
 _LEAST_M, _LEAST_INVERSE = 0.05, 0.05
 _CHANGED = 0.001  # 1/m: keyframes whose correction is off by less keep it
 _FARTHEST = 2.0  # times its measured depth is where a correction may put a surface
-FUNCTIONS = 5
-
-
-def _functions(x: Matrix, y: Matrix) -> Matrix:
-    """Return q_k at viewing rays, [..., K]."""
-    x, y = x / _HALF_WIDTH, y / _HALF_WIDTH
-    return np.stack([x, y, x * x, x * y, y * y], axis=-1)
 
 
 class DepthBend:
     """The bend of one depth camera; starts as none and learns with each pair of images."""
 
     def __init__(self, coefficients: Sequence[float] = ()) -> None:
-        start = np.array(coefficients if len(coefficients) else np.zeros(FUNCTIONS), np.float64)
-        if start.shape != (FUNCTIONS,) or not np.isfinite(start).all():
-            raise ValueError(f'coefficients: expected {FUNCTIONS} numbers, received {start}')
+        start = np.array(coefficients if len(coefficients) else np.zeros(BENDS), np.float64)
+        if start.shape != (BENDS,) or not np.isfinite(start).all():
+            raise ValueError(f'coefficients: expected {BENDS} numbers, received {start}')
         self.coefficients: tuple[float, ...] = tuple(start.tolist())
         """c_k, 1/m."""
         self._start = start
         sigma = _KNOWN_SIGMA if start.any() else _PRIOR_SIGMA
-        self._information = np.eye(FUNCTIONS) / sigma**2
+        self._information = np.eye(BENDS) / sigma**2
         self._evidence = self._information @ start
 
     def correct(self, depth_m: DepthImage, camera: PinholeCamera) -> DepthImage:
@@ -80,7 +72,7 @@ class DepthBend:
 
     def renew(self, keyframe: MapKeyframe) -> None:
         """Bring the depth of a keyframe, corrected when less was known, up to date."""
-        held = keyframe.depth_bend or (0.0,) * FUNCTIONS
+        held = keyframe.depth_bend or (0.0,) * BENDS
         change = tuple(new - old for new, old in zip(self.coefficients, held, strict=True))
         if np.abs(inverse_depth_bend(keyframe.levels[-1].camera, change)).max() < _CHANGED:
             return
@@ -109,17 +101,6 @@ def shift(depth_m: DepthImage, change: Array) -> DepthImage:
     """Add to inverse depth, shape (H, W), 1/m; what is invalid stays so."""
     factor = np.maximum(1 + depth_m * change, np.float32(1 / _FARTHEST))
     return np.asarray(depth_m / factor, np.float32)
-
-
-@lru_cache(maxsize=32)
-def inverse_depth_bend(camera: PinholeCamera, coefficients: tuple[float, ...]) -> Array:
-    """Return what is to be added to inverse depth, [H, W], 1/m."""
-    x = ((np.arange(camera.width) - camera.cx) / (camera.fx * _HALF_WIDTH)).astype(np.float32)
-    y = ((np.arange(camera.height) - camera.cy) / (camera.fy * _HALF_WIDTH)).astype(np.float32)
-    cx, cy, cxx, cxy, cyy = np.array(coefficients, np.float32)
-    image: Array = (cy * y + cyy * y * y)[:, None] + (cx * x + cxx * x * x) + np.outer(cxy * y, x)
-    image.setflags(write=False)
-    return image
 
 
 @dataclass(frozen=True)
@@ -197,7 +178,7 @@ def _residuals(
     moved = ray_one @ rotation.T + r[:, None] * translation  # the point in `other`, times r
     ray, inverse = moved / moved[:, 2:], r / moved[:, 2]
     gradient = other.gradient[v, u]
-    by_other = _functions(ray[:, 0], ray[:, 1])
+    by_other = bend_functions(ray[:, :2])
     away = ray[:, :2] - other.camera.rays()[v, u, :2]
     measured = other.inverse[v, u] + (gradient * away).sum(axis=1) + by_other @ c
     error = measured - inverse
@@ -207,7 +188,7 @@ def _residuals(
     by_point = np.column_stack([gradient, slope]) * inverse[:, None]
     by_pose = np.column_stack([by_point, np.cross(point, by_point)])
     by_inverse = -((point - translation) * by_point).sum(axis=1) / r
-    by_bend = by_other + by_inverse[:, None] * _functions(ray_one[:, 0], ray_one[:, 1])
+    by_bend = by_other + by_inverse[:, None] * bend_functions(ray_one[:, :2])
     same = np.abs(error) < _SAME_SURFACE
     if same.sum() < _MIN_PIXELS:
         return None
@@ -221,7 +202,7 @@ def _shared(
     chosen = np.flatnonzero(one.usable)
     chosen = chosen[:: 1 + len(chosen) // _MAX_PIXELS]
     rays = one.camera.rays().reshape(-1, 3)[chosen].astype(np.float64)
-    r = one.inverse.ravel()[chosen] + _functions(rays[:, 0], rays[:, 1]) @ c
+    r = one.inverse.ravel()[chosen] + bend_functions(rays[:, :2]) @ c
     moved = rays @ T_other_one[:3, :3].T + r[:, None] * T_other_one[:3, 3]
     seen = (r > _LEAST_INVERSE) & (moved[:, 2] > _LEAST_M)
     rays, r, moved = rays[seen], r[seen], moved[seen]

@@ -67,9 +67,8 @@ def lift(
 def _rays(camera: PinholeCamera, cells: Cells) -> Array:
     """Return the rays with z = 1 through the centres of cells, [M, 3]."""
     half = (cells.size - 1) / 2
-    x = (cells.column + half - camera.cx) / camera.fx
-    y = (cells.row + half - camera.cy) / camera.fy
-    return np.stack([x, y, np.ones_like(x)], axis=1).astype(np.float32)
+    tangents = camera.tangents(np.stack([cells.column + half, cells.row + half], axis=1))
+    return np.column_stack([tangents, np.ones(len(tangents))]).astype(np.float32)
 
 
 def _shapes(

@@ -183,7 +183,5 @@ def _sample(image: Array, pixel: Matrix) -> Matrix:
     return np.maximum(np.asarray(sampled[:, 0], np.float64), 1e-3)
 
 
-def _rho2(camera: PinholeCamera, pixel: NDArray[np.floating] | NDArray[np.int64]) -> Matrix:
-    x = (pixel[:, 0] - camera.cx) / camera.fx
-    y = (pixel[:, 1] - camera.cy) / camera.fy
-    return np.asarray(x**2 + y**2, np.float64)
+def _rho2(camera: PinholeCamera, pixel: NDArray[np.floating | np.integer]) -> Matrix:
+    return np.asarray((camera.tangents(pixel) ** 2).sum(axis=1))

@@ -81,10 +81,8 @@ class FeatureExtractor:
         octaves = np.array([k.octave for k in keypoints], np.uint8)
         columns, rows = np.rint(pixels).astype(int).T
         depth_m = frame.depth_m[rows, columns]
-        camera = frame.camera
-        x = (pixels[:, 0] - camera.cx) / camera.fx
-        y = (pixels[:, 1] - camera.cy) / camera.fy
-        points = np.stack([x * depth_m, y * depth_m, depth_m], axis=1).astype(np.float32)
+        rays = np.column_stack([frame.camera.tangents(pixels), np.ones(len(pixels))])
+        points = (rays * depth_m[:, None]).astype(np.float32)
         p_static = 1 - p_dynamic[rows, columns].astype(np.float32) / 255
         return Features(pixels, points, np.asarray(descriptors, np.uint8), octaves, p_static)
 

@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from bdgs_ros.back_end.calibration import Calibration, Known, bend_functions
+from bdgs_ros.back_end.calibration import Calibration, Known
 from bdgs_ros.back_end.corners import Shared
 from bdgs_ros.back_end.graph import Edge, solve
 from bdgs_ros.back_end.pair import PairFactor, condense, linearise
 from bdgs_ros.core import se3
+from bdgs_ros.core.bend import bend_functions
 from bdgs_ros.core.config import BackEndConfig
 
 CONFIG = BackEndConfig().bundle

@@ -20,6 +20,12 @@ def test_project_inverts_unproject() -> None:
     np.testing.assert_allclose(pixels, np.stack([u, v], -1).reshape(-1, 2), atol=1e-3)
 
 
+def test_project_inverts_tangents() -> None:
+    pixels = np.random.default_rng(0).uniform(0, 480, (20, 2))
+    rays = np.column_stack([FR1.tangents(pixels), np.ones(20)])
+    np.testing.assert_allclose(FR1.project(3 * rays), pixels)
+
+
 def test_scaling_keeps_the_corners_of_the_image() -> None:
     half = FR1.scaled(0.5)
     left = (-0.5 - FR1.cx) / FR1.fx

@@ -6,16 +6,11 @@ import numpy as np
 import pytest
 
 from bdgs_ros.core import se3
+from bdgs_ros.core.bend import BENDS, inverse_depth_bend
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.config import BdgsConfig, with_values
 from bdgs_ros.core.types import Keyframe, Pose, RgbdFrame
-from bdgs_ros.mapping.depth_bend import (
-    FUNCTIONS,
-    DepthBend,
-    RangeImage,
-    inverse_depth_bend,
-    shift,
-)
+from bdgs_ros.mapping.depth_bend import DepthBend, RangeImage, shift
 from bdgs_ros.mapping.growth import surface_depth
 from bdgs_ros.mapping.keyframes import MapKeyframe, build_levels
 from bdgs_ros.mapping.mapper import Mapper
@@ -72,7 +67,7 @@ def worst_cm(found: tuple[float, ...], true: tuple[float, ...]) -> float:
 
 
 def none() -> tuple[float, ...]:
-    return (0.0,) * FUNCTIONS
+    return (0.0,) * BENDS
 
 
 def test_a_bend_is_recovered_with_wrong_poses() -> None:
@@ -189,7 +184,7 @@ def test_a_keyframe_corrected_early_is_brought_up_to_date() -> None:
 
 
 def test_numbers_that_are_no_bend_are_refused() -> None:
-    for wrong in ([1.0, 2.0], [np.nan] * FUNCTIONS):
+    for wrong in ([1.0, 2.0], [np.nan] * BENDS):
         with pytest.raises(ValueError, match='coefficients'):
             DepthBend(wrong)
 
