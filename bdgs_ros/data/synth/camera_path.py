@@ -19,6 +19,8 @@ Motion = Callable[[float, Array], tuple[Array, Array]]
 """Time and the six phases of a seed to (offset right, down, ahead in m; rotation vector)."""
 
 _REST_S = (0.3, 1.3)  # the motion fades in between these times
+_TURN_RAD_S = np.radians(30)  # of a camera that turns round: 12 s until it is back
+_TURN_RADIUS_M = 0.3
 
 
 def look_at(position: Array, target: Array) -> Array:
@@ -30,6 +32,17 @@ def look_at(position: Array, target: Array) -> Array:
     T[:3, :3] = np.column_stack([right, np.cross(ahead, right), ahead])
     T[:3, 3] = position
     return T
+
+
+def _faded_in(t: float) -> float:
+    """Return how much of the time in which motion fades in is over, in [0, 1]."""
+    return float(np.clip((t - _REST_S[0]) / (_REST_S[1] - _REST_S[0]), 0, 1))
+
+
+def _faded_time(t: float) -> float:
+    """Return the integral of the fade from 0 to t in seconds."""
+    x = _faded_in(t)
+    return (_REST_S[1] - _REST_S[0]) * x**4 * (2.5 - 3 * x + x**2) + max(t - _REST_S[1], 0.0)
 
 
 def _wave(t: float, period_s: float, phase: float) -> float:
@@ -102,10 +115,12 @@ class CameraPath:
 
     def pose(self, time_s: float) -> Array:
         """Return T_world_camera at a time in seconds from the first frame."""
-        fade = float(np.clip((time_s - _REST_S[0]) / (_REST_S[1] - _REST_S[0]), 0, 1))
-        fade = fade**3 * (10 - 15 * fade + 6 * fade**2)
+        x = _faded_in(time_s)
+        fade = x**3 * (10 - 15 * x + 6 * x**2)
         if self.kind == 'halfsphere':
             return self._on_halfsphere(time_s, fade)
+        if self.kind == 'round':
+            return self._round(time_s, fade)
         offset, angles = _MOTIONS[self.kind](time_s, self.phase)
         T = look_at(self.position, self.target)
         T[:3, 3] += T[:3, :3] @ (fade * offset)
@@ -119,6 +134,21 @@ class CameraPath:
         centre = self.position + np.array([0.5, 0.0, -0.1])
         out = [-np.cos(azimuth) * np.cos(height), -np.sin(azimuth) * np.cos(height)]
         T = look_at(centre + 0.5 * np.array([*out, np.sin(height)]), self.target)
+        return self._held(T, t, fade)
+
+    def _round(self, t: float, fade: float) -> Array:
+        """Turn round and round on a small circle, looking outwards; first at the target."""
+        to_target = self.target - self.position
+        turned = _TURN_RAD_S * _faded_time(t) * (1 if self.phase[0] < np.pi else -1)
+        azimuth = np.arctan2(to_target[1], to_target[0]) + turned
+        dip = np.radians(10 + 4 * fade * _wave(t, 7.0, self.phase[1]))
+        out = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+        centre = self.position + np.array([0.7, 0.0, 0.0])
+        at = centre + _TURN_RADIUS_M * out + [0, 0, 0.08 * fade * _wave(t, 5.0, self.phase[2])]
+        return self._held(look_at(at, at + out - [0, 0, np.tan(dip)]), t, fade)
+
+    def _held(self, T: Array, t: float, fade: float) -> Array:
+        """Add the tremor of a hand."""
         jitter_m, jitter_rad = _handheld(t, self.phase)
         T[:3, 3] += fade * jitter_m
         T[:3, :3] = T[:3, :3] @ Rotation.from_rotvec(fade * jitter_rad).as_matrix()

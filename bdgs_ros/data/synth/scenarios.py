@@ -58,6 +58,25 @@ def _near_loop(
     return LoopPath([(x, middle + turn * (y - middle)) for x, y in points], speed, phase, start_s)
 
 
+def _camera_loop(layout: Layout, rng: np.random.Generator, phase: float) -> LoopPath:
+    """Return a way round a camera that turns, between it and the walls."""
+    turn, middle = float(rng.choice([-1.0, 1.0])), layout.size[1] / 2
+    angles = turn * np.linspace(0, 2 * np.pi, 8, endpoint=False)
+    points = [(1.7 + 1.25 * np.cos(a), middle + 1.5 * np.sin(a)) for a in angles]
+    return LoopPath(points, float(rng.uniform(0.8, 1.1)), phase, 0.0)
+
+
+def _walkers_all_round(
+    layout: Layout, rng: np.random.Generator, duration_s: float
+) -> list[SceneObject]:
+    """One walks round the camera, one round the table."""
+    first = layout.next_id
+    return [
+        person(first, rng, _camera_loop(layout, rng, float(rng.uniform(0, 1)))),
+        person(first + 1, rng, _table_loop(layout, rng, float(rng.uniform(0, 1)))),
+    ]
+
+
 def _two_walkers_and_ball(
     layout: Layout, rng: np.random.Generator, duration_s: float
 ) -> list[SceneObject]:
@@ -164,6 +183,7 @@ _SCENARIOS: dict[str, tuple[str, Cast]] = {
     'crowd': ('gentle', _crowd),
     'unknown_box': ('gentle', _unknown_box),
     'chair_moved': ('gentle', _chair_moved),
+    'loop_room': ('round', _walkers_all_round),
 }
 
 
