@@ -25,7 +25,8 @@ found out later. ATE in cm over all frames with a pose, nearest ground truth wit
 Horn alignment without scale; max: the largest error of a frame; coverage: frames with a pose over
 frames. RPE: translation in cm and rotation in degrees from each frame to the next, and over one
 second. A frame that is lost has no pose. ms: tracking of a frame. Configurations: weights is the
-whole method with a detector, each other one has one part off or another prediction.
+whole method with a detector, each other one has one part off or another prediction; no_loop joins
+keyframes with the newest ones alone.
 """
 
 SWITCHES: dict[str, dict[str, str]] = {
@@ -35,10 +36,13 @@ SWITCHES: dict[str, dict[str, str]] = {
     'no_prediction': {'tracking.motion.model': 'none'},
     'plain_velocity': {'tracking.motion.model': 'velocity'},
     'no_bundle': {'back_end.bundle.enabled': 'false'},
+    'no_loop': {'back_end.loop.enabled': 'false', 'back_end.bundle.older': '0'},
 }
 """The whole method with one part off; one that this version does not have is left out."""
 
 _SWITCHED = ('static', 'walking_xyz', 'walking_rpy', 'walking_halfsphere', 'crowd')
+_LOOP = 'loop_room'
+_SWITCHED_ELSEWHERE = {'no_bundle': (*_SWITCHED, _LOOP), 'no_loop': (_LOOP,)}
 _FEW_SEEDS = 2
 _QUICK_SCENARIOS = ('static', 'walking_xyz')
 _COLUMNS = {
@@ -66,7 +70,8 @@ def cells(options: Options) -> list[Cell]:
     names = _QUICK_SCENARIOS if options.quick else tuple(scenarios())
     found = _on(FULL, names, options.seeds, options)
     for switch in () if options.quick else known_switches():
-        found += _on(switch, _SWITCHED, options.seeds[:_FEW_SEEDS], options)
+        names = _SWITCHED_ELSEWHERE.get(switch, _SWITCHED)
+        found += _on(switch, names, options.seeds[:_FEW_SEEDS], options)
     return found
 
 
@@ -85,9 +90,9 @@ def _on(
         'weights': sequences.weights_path(options).name,
     }
     real = {**sequences.real_settings(options), **common}
-    synth = {**sequences.synth_settings(options), **common}
     found = [Cell(sequence.name, configuration, 0, real) for sequence in REAL]
     for name in scenarios:
+        synth = {**sequences.synth_settings(name, options), **common}
         found += [Cell(sequences.synth_name(name), configuration, s, synth) for s in seeds]
     return found
 

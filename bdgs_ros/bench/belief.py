@@ -137,7 +137,7 @@ def _late_starts(options: Options) -> list[Cell]:
 
 def _synth(scenario: str, configuration: str, seed: int, options: Options, start: int = 0) -> Cell:
     common = _settings(configuration, options, start)
-    settings = {**sequences.synth_settings(options), **common}
+    settings = {**sequences.synth_settings(scenario, options), **common}
     return Cell(sequences.synth_name(scenario), configuration, seed, settings)
 
 

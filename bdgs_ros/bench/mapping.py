@@ -90,19 +90,19 @@ def cells(options: Options) -> list[Cell]:
     names = _QUICK_SCENARIOS if options.quick else _SCENARIOS
     names = tuple(scenarios()) if options.all_cells else names
     real = [sequence.name for sequence in REAL]
-    synth = [sequences.synth_name(name) for name in names]
-    looped = [real[0], *(synth[:1] if options.all_cells else [])]
+    synth = {sequences.synth_name(n): sequences.synth_settings(n, options) for n in names}
+    looped = [real[0], *(list(synth)[:1] if options.all_cells else [])]
     configuration = 'weights' if sequences.weights_path(options).is_file() else 'geometric'
     common = sequences.detector_settings(configuration, options)
-    of_real, of_synth = sequences.real_settings(options), sequences.synth_settings(options)
+    of_real = sequences.real_settings(options)
     refine = {'refine_s': _refine_s(options)}
     found = [Cell(n, configuration, 0, {**of_real, **common, **refine}) for n in real]
-    for name in synth:
+    for name, of_synth in synth.items():
         settings = {**of_synth, **common, **refine}
         found += [Cell(name, configuration, seed, settings) for seed in options.seeds]
     for name in looped:
         settings = {
-            **(of_real if name in real else of_synth),
+            **synth.get(name, of_real),
             **common,
             'frames_run': _loop(options),
         }

@@ -64,7 +64,7 @@ def cells(options: Options) -> list[Cell]:
 
 def _synth(scenario: str, fault: str, seed: int, options: Options) -> Cell:
     detector = sequences.detector_settings('weights', options)
-    settings = {**sequences.synth_settings(options), **detector}
+    settings = {**sequences.synth_settings(scenario, options), **detector}
     return Cell(sequences.synth_name(scenario), fault, seed, settings)
 
 

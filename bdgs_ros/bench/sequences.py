@@ -14,6 +14,7 @@ from bdgs_ros.core.errors import DatasetError, ModelError
 
 SYNTH_FRAMES = 300
 SYNTH_FRAMES_QUICK = 60
+SYNTH_LONGER = {'loop_room': 450}  # frames until the story is told: the camera is back
 REAL_FRAMES_QUICK = 60
 WEIGHTS = Path('models') / 'yolov5n-320.onnx'
 _SYNTH = 'synth_'
@@ -82,9 +83,10 @@ def real_settings(options: Options) -> dict[str, Any]:
     return {'kind': 'real', 'frames': REAL_FRAMES_QUICK if options.quick else None}
 
 
-def synth_settings(options: Options) -> dict[str, Any]:
+def synth_settings(scenario: str, options: Options) -> dict[str, Any]:
     """Return what a cell on a synthetic recording is known by."""
-    return {'kind': 'synth', 'frames': SYNTH_FRAMES_QUICK if options.quick else SYNTH_FRAMES}
+    frames = SYNTH_LONGER.get(scenario, SYNTH_FRAMES)
+    return {'kind': 'synth', 'frames': SYNTH_FRAMES_QUICK if options.quick else frames}
 
 
 def cell_recording(cell: Cell, options: Options) -> Path:

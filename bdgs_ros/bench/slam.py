@@ -59,8 +59,8 @@ def cells(options: Options) -> list[Cell]:
         for sequence in REAL:
             settings = {**sequences.real_settings(options), **common}
             found.append(Cell(sequence.name, configuration, 0, settings))
-        settings = {**sequences.synth_settings(options), **common}
         for name in names:
+            settings = {**sequences.synth_settings(name, options), **common}
             sequence_name = sequences.synth_name(name)
             found += [Cell(sequence_name, configuration, s, settings) for s in options.seeds]
     return sorted(found, key=lambda cell: (cell.settings['kind'], cell.sequence, cell.seed))

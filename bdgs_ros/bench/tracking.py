@@ -70,7 +70,7 @@ def cells(options: Options) -> list[Cell]:
     """List each recording alone and live; several seeds are repetitions of the live ones."""
     common = sequences.detector_settings('weights', options)
     real = {**sequences.real_settings(options), **common}
-    synth = {**sequences.synth_settings(options), **common}
+    synth = {**sequences.synth_settings(_SYNTH, options), **common}
     chosen = [(sequence.name, real) for sequence in REAL]
     chosen.append((sequences.synth_name(_SYNTH), synth))
     found = []

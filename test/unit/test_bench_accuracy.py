@@ -27,6 +27,14 @@ def test_the_whole_method_has_five_seeds_and_each_switch_two(options):
     assert {'bonn_crowd_part/weights/0', 'fr1_rpy_part/plain_velocity/0'} <= set(labels)
 
 
+def test_a_loop_is_recorded_to_its_end_and_run_without_closing_it(options):
+    by_label = {cell.label: cell for cell in accuracy.cells(options)}
+    assert by_label['synth_loop_room/weights/0'].settings['frames'] == 450
+    assert by_label['synth_static/weights/0'].settings['frames'] == 300
+    assert {'synth_loop_room/no_loop/1', 'synth_loop_room/no_bundle/0'} <= set(by_label)
+    assert 'synth_static/no_loop/0' not in by_label
+
+
 def test_switches_are_parameters_or_left_out(options, monkeypatch):
     for name in accuracy.known_switches():
         with_values(BdgsConfig(), accuracy.SWITCHES[name])
