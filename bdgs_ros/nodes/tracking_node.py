@@ -67,10 +67,16 @@ class TrackingNode(GraphNode):
             self._finish(raw, FrameStatus(raw.stamp_ns, FrameState.PAUSED))
             return
         self._health.mark('frame', '')
+        self._note_depth(frame)
         if not self._has_begun and not self._begin(frame):
             self._finish(raw, FrameStatus(raw.stamp_ns, FrameState.LOST))
             return
         self._track(raw, frame)
+
+    def _note_depth(self, frame: RgbdFrame) -> None:
+        lack = self._decoder.lack_of_depth(frame)
+        self._health.counts['frames_without_depth'] += bool(lack)
+        self._health.set_problem('depth', lack)
 
     def _begin(self, frame: RgbdFrame) -> bool:
         """Begin at the origin of a new world, or in a map once mapping has shown it."""
