@@ -17,7 +17,6 @@ run that was interrupted goes on where it stopped. More is optional:
 
 from __future__ import annotations
 
-import fnmatch
 import hashlib
 import json
 import logging
@@ -34,6 +33,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from bdgs_ros.bench import parallel
+from bdgs_ros.bench.choice import choose
 from bdgs_ros.core.errors import BdgsError
 from bdgs_ros.core.files import write_text
 from bdgs_ros.eval import provenance
@@ -132,10 +132,15 @@ def run_bench(
         `summary`, `rows`, `protocol` and provenance, as in `results.json`. A cell that failed is
         a row with `error`; it is tried again next time.
 
+    Raises
+    ------
+    ConfigError
+        If a pattern matches no cell.
+
     """
     from tqdm import tqdm
 
-    chosen = [cell for cell in bench.cells(options) if _matches(cell, only)]
+    chosen = choose(bench.cells(options), only, bench.NAME)
     parallel_safe = getattr(bench, 'PARALLEL', False)
     run = _at_once if parallel_safe and options.jobs > 1 else _in_turn
     rows: dict[int, dict[str, Any]] = {}
@@ -150,11 +155,6 @@ def run_bench(
     write_text(options.work / 'results.json', dump_json(results) + '\n')
     write_text(options.work / 'results.md', to_markdown(results))
     return results
-
-
-def _matches(cell: Cell, only: Sequence[str]) -> bool:
-    names = (cell.label, cell.sequence, cell.configuration)
-    return not only or any(fnmatch.fnmatch(name, p) for p in only for name in names)
 
 
 def _in_turn(

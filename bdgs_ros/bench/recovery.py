@@ -26,25 +26,25 @@ PARALLEL = True
 prepare = sequences.prepare
 PROTOCOL = """
 Every frame goes through the pipeline in order, none dropped, until 3 s after the fault. black,
-grey: the lens is covered for 1 s half way, dark or by something bright, without depth; wall: a
-plane of one colour fills the view for 1 s; jump: the recording jumps back by 0.5 m or 30 degrees
-(as far as the recording allows: jumped_m, jumped_deg), stamps go on at camera rate; none: no
-fault. Errors are of the position, after rigid alignment of the frames before the fault to the
-truth. false_lost: frames without a pose before the fault. to_lost_s: from its first frame to the
-first without a pose; empty if it was found again at once. wrong_ok: frames after the beginning
-of the fault with a pose more than 10 cm off. to_found_s: from the first frame with a view to the
-first good pose (within 10 cm); never_found: 1 if there is none. relative_ratio, the inliers over
-those of the last frames, is the sharpest part of the test: least, 0.2 %, 1 % and median of the
-good frames, and median, 99 % and largest of those that show no known view or were aligned more
-than 10 cm off.
+grey: the lens is covered for 1 s half way, dark or by something bright, without depth; blind:
+depth alone is lost for 1 s; wall: a plane of one colour fills the view for 1 s; jump: the
+recording jumps back by 0.5 m or 30 degrees (as far as the recording allows: jumped_m, jumped_deg),
+stamps go on at camera rate; none: no fault. Errors are of the position, after rigid alignment of
+the frames before the fault to the truth. false_lost: frames without a pose before the fault.
+to_lost_s: from its first frame to the first without a pose; empty if it was found again at once.
+wrong_ok: frames after the beginning of the fault with a pose more than 10 cm off. to_found_s: from
+the first frame with a view to the first good pose (within 10 cm); never_found: 1 if there is none.
+relative_ratio, the inliers over those of the last frames, is the sharpest part of the test: least,
+0.2 %, 1 % and median of the good frames, and median, 99 % and largest of those that show no known
+view or were aligned more than 10 cm off.
 """
 
-FAULTS = ('jump', 'black', 'grey', 'wall', 'none')
+FAULTS = ('jump', 'black', 'grey', 'blind', 'wall', 'none')
 _FAR_M = 0.1  # a pose further off is wrong
 _COVERED_S = 1.0
 _AFTER_S = 3.0
 _QUICK = (('walking_xyz', 'black'),)
-_ONLY_ONE_SEED = ('grey', 'wall')
+_ONLY_ONE_SEED = ('grey', 'blind', 'wall')
 
 
 def cells(options: Options) -> list[Cell]:
@@ -95,8 +95,7 @@ def make_fault(sequence: Frames, name: str, seed: int) -> Fault:
     if name == 'none':
         return Fault(faults.FaultySequence(sequence, np.arange(count)), count, count, {})
     if name != 'jump':
-        cover = {'black': faults.black, 'grey': faults.grey, 'wall': faults.wall}[name]
-        frames = faults.covered(sequence, count // 2, _COVERED_S, cover, seed)
+        frames = faults.covered(sequence, count // 2, _COVERED_S, getattr(faults, name), seed)
         return Fault(frames, frames.covered.start, frames.covered.stop, {})
     if sequence.ground_truth is None:
         raise DatasetError(f"'{sequence.name}' has no ground truth to choose a jump by")

@@ -10,7 +10,7 @@ from typing import TypeVar
 from nav_msgs.msg import Path
 from rclpy.node import Node
 from sensor_msgs.msg import Image
-from std_msgs.msg import Bool, Empty
+from std_msgs.msg import Bool, Empty, String
 
 from bdgs_ros.bridge import conversions, topics
 from bdgs_ros.bridge.cdr_image import CdrImage, image_from_cdr
@@ -61,8 +61,12 @@ class Feedback:
         self._keyframes: OrderedDict[int, PinholeCamera] = OrderedDict()
         self._asked_s = -math.inf
         self._map_is_frozen = config.localization
+        self.loaded_map = ''
+        """The file of the map that mapping has loaded at run time and still has."""
+        self._is_replaced = False
         self._request = node.create_publisher(Empty, topics.MAP_REQUEST, topics.RELIABLE)
         node.create_subscription(Bool, topics.LOCALIZATION, self._on_localization, topics.LATCHED)
+        node.create_subscription(String, topics.MAP_LOADED, self._on_map_loaded, topics.LATCHED)
         node.create_subscription(Image, topics.LABELS, self._keep_labels, topics.KEPT, raw=True)
         self._moved: dict[int, Pose] = {}
         node.create_subscription(Path, topics.KEYFRAMES, self._on_keyframes, topics.LATCHED)
@@ -85,10 +89,23 @@ class Feedback:
     def _on_localization(self, message: Bool) -> None:
         self._map_is_frozen = message.data
 
+    def _on_map_loaded(self, message: String) -> None:
+        self.loaded_map, self._is_replaced = message.data, bool(message.data)
+
+    def map_was_replaced(self) -> bool:
+        """Return whether mapping has loaded another map since the last call."""
+        replaced, self._is_replaced = self._is_replaced, False
+        return replaced
+
+    def forget_map(self) -> None:
+        """Expect mapping to forget its map with everything else, unless it is frozen."""
+        if not self._map_is_frozen:
+            self.loaded_map = ''
+
     @property
     def begins_in_map(self) -> bool:
         """Whether the first frame is to be found in a map that exists."""
-        return self._config.begins_in_map or self._map_is_frozen
+        return self._config.begins_in_map or self._map_is_frozen or bool(self.loaded_map)
 
     def entrance(self, camera: PinholeCamera) -> tuple[bool, ModelView | None]:
         """

@@ -215,8 +215,8 @@ class FrameDecoder:
         Raises
         ------
         DatasetError
-            If an encoding or size is not as expected, the camera is not calibrated, or the depth
-            holds nothing usable.
+            If an encoding or size is not as expected, the camera is not calibrated, or the scale
+            of the depth is not plausible. No depth at all is no error: a lens may be covered.
 
         """
         camera = conversions.camera_from_message(raw.info, self._info_topic)
@@ -240,6 +240,16 @@ class FrameDecoder:
             self._rectifier = (camera, Rectifier(camera))
         return self._rectifier[1]
 
+    def lack_of_depth(self, frame: RgbdFrame) -> str:
+        """Say in words that a frame has no depth; nothing where it has."""
+        if frame.depth_m.any():
+            return ''
+        return (
+            f"topic '{self._depth_topic}': expected depth, received an image of zeros or NaN; "
+            'unless the camera is covered, check it: colour alone tells the pose for a while, but '
+            'no keyframe can be made'
+        )
+
     def _check_size(self, what: str, topic: str, image: CdrImage, camera: PinholeCamera) -> None:
         if (image.width, image.height) != (camera.width, camera.height):
             raise DatasetError(
@@ -250,10 +260,6 @@ class FrameDecoder:
             )
 
     def _check_depth(self, depth_m: DepthImage, encoding: str) -> None:
-        if not depth_m.any():
-            raise DatasetError(
-                f"topic '{self._depth_topic}': expected depth, received an image of zeros or NaN"
-            )
         sample = depth_m[::_DEPTH_STRIDE, ::_DEPTH_STRIDE]
         median = float(np.median(sample[sample > 0])) if sample.any() else 1.0
         low, high = _PLAUSIBLE_M

@@ -120,7 +120,7 @@ class MappingNodeConfig(GraphConfig):
     start_pose: str = param(
         '',
         "about where the camera starts in the map of map_file: 'x y z qx qy qz qw' in metres, as "
-        "in the trajectory files; empty: the map's origin",
+        "in the trajectory files; empty: the map's origin; may change at run time",
     )
     final_trajectory_file: str = param(
         '', 'where bdgs/save_final_trajectory writes; may change at run time'

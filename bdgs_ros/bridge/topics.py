@@ -36,6 +36,8 @@ MAP_REQUEST = 'bdgs/map_request'
 """Tracking asks to be shown the map that it is to begin in."""
 LOCALIZATION = 'bdgs/localization'
 """Whether the map is frozen."""
+MAP_LOADED = 'bdgs/map_loaded'
+"""The file of the map that bdgs/load_map has put in place of the one before; empty: none."""
 
 TF = '/tf'
 CLOCK = '/clock'

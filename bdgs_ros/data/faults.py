@@ -32,6 +32,11 @@ def grey(frame: RgbdFrame, rng: np.random.Generator) -> RgbdFrame:
     return _blank(frame, rng, 128.0, 6.0, np.zeros_like(frame.depth_m))
 
 
+def blind(frame: RgbdFrame, rng: np.random.Generator) -> RgbdFrame:
+    """Lose the depth alone, as where a driver drops it or the sun outshines its projector."""
+    return replace(frame, depth_m=np.zeros_like(frame.depth_m))
+
+
 def wall(frame: RgbdFrame, rng: np.random.Generator) -> RgbdFrame:
     """Stand before a wall of one colour, 1.5 m away, measured as a Kinect does."""
     depth_m = rng.normal(1.5, 0.0015 * 1.5**2, frame.depth_m.shape)
@@ -130,7 +135,7 @@ class FaultySequence(RearrangedSequence):
     covered : range
         Places of `indices` at which the view is covered.
     cover : callable, optional
-        What covers it: `black`, `grey` or `wall`.
+        What covers it: `black`, `grey`, `blind` or `wall`.
     seed : int
         Of the noise.
 

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import sys
-import threading
-import time
 from collections import deque
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -16,7 +13,7 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path as PathMessage
 from sensor_msgs.msg import Image
-from std_msgs.msg import Bool, Empty
+from std_msgs.msg import Empty
 
 from bdgs_ros.back_end.back_end import BackEnd
 from bdgs_ros.bridge import conversions, parameters, topics
@@ -27,24 +24,19 @@ from bdgs_ros.bridge.map_output import MapOutput
 from bdgs_ros.bridge.model_view import ModelPublisher
 from bdgs_ros.bridge.node_config import MappingNodeConfig
 from bdgs_ros.bridge.runner import GraphNode, run
-from bdgs_ros.bridge.services import SideNode
 from bdgs_ros.bridge.stamped import StampBuffer
 from bdgs_ros.bridge.worker import Worker
-from bdgs_ros.core import se3
-from bdgs_ros.core.errors import BdgsError, ConfigError
+from bdgs_ros.core.errors import BdgsError
 from bdgs_ros.core.types import (
-    NO_KEYFRAME_NS,
     Keyframe,
     ModelView,
-    Pose,
     ProbabilityImage,
     RgbdFrame,
     StampedPose,
-    Trajectory,
 )
-from bdgs_ros.data.trajectory_io import parse_pose, write_trajectory
-from bdgs_ros.mapping.entrance import check_entrance, entrance
 from bdgs_ros.mapping.mapper import Mapper
+from bdgs_ros.nodes.map_entrance import MapEntrance
+from bdgs_ros.nodes.map_services import AT_RUN_TIME, LiveMap, MapServices
 from bdgs_ros.pipeline import take_keyframe
 
 _FRAME_WAIT_S = 2.0
@@ -53,7 +45,6 @@ _LABELS_WAIT_S = 0.3
 _LABELS_KEPT = 90
 _MAX_LABEL_AGE_NS = 500_000_000
 _POSES_KEPT = 1000
-_AT_RUN_TIME = ('map_file', 'final_trajectory_file')
 
 
 class MappingNode(GraphNode):
@@ -61,26 +52,24 @@ class MappingNode(GraphNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__('mapping_node', **options)
-        config = parameters.declare(self, MappingNodeConfig(), runtime=_AT_RUN_TIME)
+        config = parameters.declare(self, MappingNodeConfig(), runtime=AT_RUN_TIME)
         cv2.setNumThreads(1)
         self.nice = config.mapping_nice
         self._config = config
         self._health = Health(self, 'mapping')
         self._mapper = Mapper(config.mapping, config.belief, self._is_hurried)
-        self._start_pose = _parse_start_pose(config.start_pose)
+        self._live = LiveMap(self._mapper)
         self._back_end = BackEnd(config.back_end)
         self._tracked: deque[StampedPose] = deque(maxlen=_POSES_KEPT)
-        self._lock = threading.Lock()  # of the mapper: worker and services
-        self._version = 0
-        self._saved = (0, time.monotonic())
+        self._lock = self._live.lock  # of the mapper: worker and services
         self._frames: StampBuffer[RawFrame] = StampBuffer(config.frame_buffer)
         self._labels: StampBuffer[CdrImage] = StampBuffer(_LABELS_KEPT)
         self._decoder = FrameDecoder.of(self)
         self._models = ModelPublisher(self, self._config.map_frame)
         self._output = MapOutput(self, config, self._health)
-        self._poses: list[StampedPose] = []
-        self._newest: RawFrame | None = None
-        self._is_asked = False
+        self._map_services = MapServices(
+            self, config, self._health, self._live, self._settle, self._on_loaded
+        )
         self._worker: Worker[Callable[[], None]] = Worker(
             lambda task: task(),
             self._health.error,
@@ -88,9 +77,12 @@ class MappingNode(GraphNode):
             self._on_idle,
             nice=config.mapping_nice,
         )
+        self._entrance = MapEntrance(
+            self, self._live, self._decoder, self._models, self._output, self._health,
+            config.mapping.width, self._worker.put,
+        )  # fmt: skip
         self._subscribe()
-        self._load_at_start()
-        self._serve()
+        self._map_services.start()
         self.get_logger().info(f'mapping is ready: mode {config.mode}')
 
     def _subscribe(self) -> None:
@@ -105,71 +97,34 @@ class MappingNode(GraphNode):
         self.create_subscription(
             Empty, topics.RESET_EVENT, lambda _: self._forget(), topics.RELIABLE
         )
-        self.create_subscription(
-            Empty, topics.MAP_REQUEST, lambda _: self._on_request(), topics.RELIABLE
-        )
         self._keyframes = self.create_publisher(PathMessage, topics.KEYFRAMES, topics.LATCHED)
-        self._localization = self.create_publisher(Bool, topics.LOCALIZATION, topics.LATCHED)
-
-    def _serve(self) -> None:
-        # A service waits for the keyframe at hand; meanwhile images must still be taken.
-        self._side = SideNode(self)
-        self._side.serve_trigger(topics.SAVE_MAP, self._on_save)
-        self._side.serve_trigger(topics.LOAD_MAP, self._on_load)
-        self._side.serve_trigger(topics.SAVE_FINAL_TRAJECTORY, self._on_save_trajectory)
-        self._side.serve_switch(topics.SET_LOCALIZATION_MODE, self._on_localization)
-        self._side.start()
 
     def _keep_frame(self, raw: RawFrame) -> None:
         self._frames.put(raw.stamp_ns, raw)
-        self._newest = raw
-        self._answer_request()
+        self._entrance.note_frame(raw)
 
     def _keep_labels(self, message: bytes) -> None:
         image = image_from_cdr(message)
         self._labels.put(conversions.stamp_ns(image), image)
 
     def _keep_pose(self, message: PoseStamped) -> None:
+        if not self._live.is_entered:
+            return
         pose = conversions.pose_from_message(message.pose)
-        self._poses.append(StampedPose(conversions.stamp_ns(message), pose))
-        self._tracked.append(self._poses[-1])
+        self._live.poses.append(StampedPose(conversions.stamp_ns(message), pose))
+        self._tracked.append(self._live.poses[-1])
         self._output.note_pose(message, frozen=self._mapper.frozen)
         if self._mapper.frozen:
             self._worker.wake()
 
-    def _on_request(self) -> None:
-        self._is_asked = True
-        self._answer_request()
-
-    def _answer_request(self) -> None:
-        """Show tracking the map that it begins in, as soon as the camera is known."""
-        if self._is_asked and self._newest is not None:
-            self._is_asked = False
-            self._worker.put(partial(self._show_entrance, self._newest))
-
-    def _show_entrance(self, raw: RawFrame) -> None:
-        view = None
-        try:
-            camera = self._decoder.camera(raw)
-            self._output.see_through(camera, raw.color.header.frame_id)
-            with self._lock:
-                if len(self._mapper.map):
-                    width = self._config.mapping.width
-                    view = entrance(self._mapper, self._where_it_starts(), camera, width)
-            if view is not None:
-                check_entrance(view, self._map_file())
-        except BdgsError as error:
-            self._health.error(error)
-        finally:  # an empty answer says that there is no map
-            self._models.publish(NO_KEYFRAME_NS, view)
-
-    def _where_it_starts(self) -> Pose:
-        """Return where the camera was last, if tracking asks because it was restarted."""
-        return self._poses[-1].T_world_camera if self._poses else self._start_pose
-
     def _queue_keyframe(self, message: PoseStamped) -> None:
+        stamp_ns = conversions.stamp_ns(message)
+        if not self._live.is_entered:
+            self._health.counts['keyframes_of_another_world'] += 1
+            self._models.publish(stamp_ns, None)
+            return
         # Its images are taken along now: they may be forgotten when its turn comes.
-        raw = self._frames.get(conversions.stamp_ns(message))
+        raw = self._frames.get(stamp_ns)
         self._worker.put(partial(self._on_keyframe, message, raw))
 
     def _on_keyframe(self, message: PoseStamped, raw: RawFrame | None) -> None:
@@ -194,7 +149,7 @@ class MappingNode(GraphNode):
             self._observe_until(stamp_ns)
             early = None if self._config.lockstep else partial(self._models.publish, stamp_ns)
             view = take_keyframe(self._back_end, self._mapper, keyframe, early)
-            self._version += not self._mapper.frozen
+            self._live.version += not self._mapper.frozen
         self._health.counts['keyframes'] += 1
         return view
 
@@ -245,95 +200,42 @@ class MappingNode(GraphNode):
         """Between keyframes: show the map, and save it if that is due."""
         with self._lock:
             more_to_render = self._output.render(self._mapper)
-            self._output.publish_map(self._mapper, self._version, self._config.belief.margin)
-        period_s = self._config.autosave_s
-        version, saved_s = self._saved
-        if period_s and self._version != version and time.monotonic() - saved_s >= period_s:
-            self._save()
+            self._output.publish_map(self._mapper, self._live.version, self._config.belief.margin)
+        self._map_services.save_if_due()
         if more_to_render:
             self._worker.wake()
 
     def _forget(self) -> None:
         self._frames.clear()
-        self._poses = []
-        self._newest = None
+        self._live.poses, self._live.is_entered = [], True
+        self._entrance.forget()
         self._worker.restart(self._start_over)
 
     def _start_over(self) -> None:
         with self._lock:
             if not self._mapper.frozen:  # a map to localise in outlives the camera's jumps
                 self._mapper.reset()
-                self._version += 1
+                self._live.version += 1
+                self._map_services.withdraw()
             self._back_end.reset()
             self._tracked.clear()
         self._output.forget()
 
-    def _map_file(self) -> Path:
-        file = str(self.get_parameter('map_file').value)
-        if not file:
-            raise ConfigError("where? set the parameter 'map_file' of mapping_node")
-        return Path(file)
-
-    def _on_save(self) -> str:
-        self._worker.wait_idle(_PENDING_S)  # keyframes that have arrived belong into the file
-        return self._save()
-
-    def _save(self) -> str:
-        file = self._map_file()
-        with self._lock:
-            self._mapper.save(file)
-            count = len(self._mapper.map)
-        self._saved = (self._version, time.monotonic())
-        self._health.publish()
-        return f"{count} Gaussians in '{file}'"
-
-    def _on_load(self) -> str:
-        file = self._map_file()
-        with self._lock:
-            self._mapper.load(file)
-            self._mapper.history.begin_run()
-            self._back_end.start_from(self._mapper.readout_s)
-            count = len(self._mapper.map)
-        self._version += 1
-        return f"{count} Gaussians from '{file}'"
-
-    def _on_save_trajectory(self) -> str:
-        file = str(self.get_parameter('final_trajectory_file').value)
-        if not file:
-            raise ConfigError(
-                "where to? set the parameter 'final_trajectory_file' of mapping_node"
-            )
+    def _settle(self) -> None:
         self._worker.wait_idle(_PENDING_S)
-        with self._lock:
-            final = self._mapper.final_trajectory(Trajectory(tuple(self._poses)))
-        write_trajectory(Path(file), final)
-        return f"{len(final)} poses in '{file}'"
 
-    def _load_at_start(self) -> None:
-        # Without the map there is nothing to localise in; mapping can begin without.
-        if self._config.localization or (
-            self._config.load_at_start and self._map_file().is_file()
-        ):
-            self.get_logger().info(self._on_load())
-        self._on_localization(self._config.localization)
-
-    def _on_localization(self, enabled: bool) -> str:
-        with self._lock:
-            self._mapper.frozen = enabled
-        self._localization.publish(Bool(data=enabled))
-        return 'the map is frozen' if enabled else 'the map grows'
+    def _on_loaded(self) -> None:
+        """Give up what belongs to the world before; the mapper is locked and has another map."""
+        self._worker.restart(lambda: None)
+        self._tracked.clear()
+        self._back_end.start_from(self._mapper.readout_s)
+        self._output.forget()
+        self._publish_keyframes(0)
 
     def close(self) -> None:
         """Stop working."""
-        self._side.stop()
+        self._map_services.stop()
         self._worker.stop()
-
-
-def _parse_start_pose(text: str) -> Pose:
-    try:
-        return parse_pose(text) if text else se3.identity()
-    except ValueError as error:
-        raise ConfigError(f"'start_pose': {error}") from error
 
 
 def main(args: list[str] | None = None) -> int:

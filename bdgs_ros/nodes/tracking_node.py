@@ -57,6 +57,9 @@ class TrackingNode(GraphNode):
         self.get_logger().info(f'tracking is ready: mode {config.mode}')
 
     def _on_frame(self, raw: RawFrame) -> None:
+        if self._feedback.map_was_replaced():
+            self._start_over()
+            self.get_logger().info(f"the map is now '{self._feedback.loaded_map}'")
         try:
             frame = None if self._paused else self._decoder.decode(raw)
         except DatasetError as error:
@@ -67,10 +70,16 @@ class TrackingNode(GraphNode):
             self._finish(raw, FrameStatus(raw.stamp_ns, FrameState.PAUSED))
             return
         self._health.mark('frame', '')
+        self._note_depth(frame)
         if not self._has_begun and not self._begin(frame):
             self._finish(raw, FrameStatus(raw.stamp_ns, FrameState.LOST))
             return
         self._track(raw, frame)
+
+    def _note_depth(self, frame: RgbdFrame) -> None:
+        lack = self._decoder.lack_of_depth(frame)
+        self._health.counts['frames_without_depth'] += bool(lack)
+        self._health.set_problem('depth', lack)
 
     def _begin(self, frame: RgbdFrame) -> bool:
         """Begin at the origin of a new world, or in a map once mapping has shown it."""
@@ -86,9 +95,10 @@ class TrackingNode(GraphNode):
         return True
 
     def _places(self) -> list[Keyframe]:
-        """Read the keyframes of the map that mapping began with: the camera may be anywhere."""
-        file = str(self.get_parameter('map_file').value)
-        if not file or not self._config.begins_in_map:
+        """Read the keyframes of the map that mapping has loaded: the camera may be anywhere."""
+        begun = str(self.get_parameter('map_file').value) if self._config.begins_in_map else ''
+        file = self._feedback.loaded_map or begun
+        if not file:
             return []
         try:
             places = load_places(Path(file))
@@ -141,14 +151,18 @@ class TrackingNode(GraphNode):
 
     def _forget(self) -> None:
         """Start over: the next frame is the origin of the world."""
-        self._worker.restart(self._start_over)
+        self._feedback.forget_map()
+        self._worker.restart(self._reset)
+
+    def _reset(self) -> None:
+        self._start_over()
+        self.get_logger().info('reset: the next frame is the origin')
 
     def _start_over(self) -> None:
         self._tracker.reset()
         self._has_begun = False
         self._feedback.clear()
         self._output.clear()
-        self.get_logger().info('reset: the next frame is the origin')
 
     def _on_reset(self) -> str:
         self._source.clear()

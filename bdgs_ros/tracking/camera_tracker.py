@@ -200,8 +200,20 @@ class CameraTracker:
     def _begin(
         self, frame: RgbdFrame, current: ImagePyramid, p_dynamic: ProbabilityImage
     ) -> TrackingResult:
-        """Make the first frame the origin of the world and a keyframe."""
+        """Make the first frame that shows anything the origin of the world and a keyframe."""
         T_world_camera, covariance = se3.identity(), 1e-6 * np.eye(6)
+        if not self._loss.can_be_aligned_to(frame.depth_m, p_dynamic):
+            nowhere = np.asarray(np.linalg.inv(information_of(_START_SIGMA)))
+            return TrackingResult(
+                frame.stamp_ns,
+                TrackingStatus.LOST,
+                T_world_camera,
+                nowhere,
+                False,
+                p_dynamic,
+                0.0,
+                0.0,
+            )
         self._motion.update(frame.stamp_ns, T_world_camera, covariance)
         self._become_keyframe(frame, T_world_camera, current, p_dynamic)
         return TrackingResult(
@@ -305,7 +317,8 @@ class CameraTracker:
         """Believe a pose; where the camera was lost, only one that is sure or seen twice."""
         start, estimate = attempt.start, attempt.best
         was_lost = self._is_lost or start.is_far
-        if was_lost and not (start.confirms or self._loss.is_sure(estimate.quality)):
+        is_sure = start.confirms or self._loss.is_sure(estimate.quality)
+        if was_lost and not (is_sure and self._can_be_keyframe(frame, attempt)):
             self._hypothesis = Hypothesis(frame.stamp_ns, estimate.T_world_camera, start)
             return self._lost(frame, attempt)
         if was_lost:
@@ -314,7 +327,9 @@ class CameraTracker:
             self._is_lost, self._hypothesis = False, None
         self._motion.update(frame.stamp_ns, estimate.T_world_camera, estimate.quality.covariance)
         self._loss.accept(estimate.quality)
-        is_keyframe = start.is_far or self._needs_keyframe(attempt)
+        is_keyframe = start.is_far or (
+            self._needs_keyframe(attempt) and self._can_be_keyframe(frame, attempt)
+        )
         if is_keyframe:
             self._become_keyframe(
                 frame, estimate.T_world_camera, attempt.current, attempt.p_dynamic
@@ -342,6 +357,9 @@ class CameraTracker:
         T_keyframe_world = se3.inverse(self._keyframe.T_world_camera)
         T_keyframe_camera = T_keyframe_world @ attempt.best.T_world_camera
         return self._choice.is_due(T_keyframe_camera, attempt.coarse.quality.overlap)
+
+    def _can_be_keyframe(self, frame: RgbdFrame, attempt: Attempt) -> bool:
+        return self._loss.can_be_aligned_to(frame.depth_m, attempt.p_dynamic)
 
     def _become_keyframe(
         self,

@@ -14,10 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from bdgs_ros.core.config.tracking import LossConfig
+from bdgs_ros.core.types import DepthImage, ProbabilityImage
 from bdgs_ros.tracking.align import AlignResult
 
 _MEMORY = 20  # frames that say what is usual
 _LEAST_MEMORY = 3
+_STRIDE = 4  # pixels; a share needs no more
 _USUAL = 0.8  # inlier ratio, where no frame was tracked yet
 
 
@@ -91,3 +93,22 @@ class LossTest:
     def is_sure(self, quality: AlignResult) -> bool:
         """Tell whether one such frame is enough to be found after a loss."""
         return self.evidence(quality).relative_ratio >= self._config.sure_ratio
+
+    def can_be_aligned_to(self, depth_m: DepthImage, p_dynamic: ProbabilityImage) -> bool:
+        """
+        Tell whether later frames could pass the test of coverage against this one.
+
+        A frame without depth may well be aligned by its colour, but nothing can be aligned to
+        it: it is no keyframe, and a map would get nothing from it.
+
+        Parameters
+        ----------
+        depth_m : ndarray, shape (H, W), float32
+            Metres; 0 or NaN where invalid.
+        p_dynamic : ndarray, shape (H, W), uint8
+            P(dynamic) x 255.
+
+        """
+        known = depth_m[::_STRIDE, ::_STRIDE] > 0
+        still = p_dynamic[::_STRIDE, ::_STRIDE] < 128
+        return bool((known & still).mean() >= self._config.coverage)

@@ -128,12 +128,12 @@ def test_depth_of_another_size_or_encoding(graph: Graph, ros: Callable) -> None:
             '32FC1',
         )
         send_until("received 'rgb8'", np.ones((48, 64, 3), np.uint8), 'rgb8')
-        send_until('zeros or NaN', np.full((48, 64), np.nan, np.float32), '32FC1')
         send_until('more than 30 m in the median', np.full((48, 64), 1500, np.float32), '32FC1')
+        send_until('zeros or NaN', np.full((48, 64), np.nan, np.float32), '32FC1')
         deadline = time.monotonic() + 5
-        while not states and time.monotonic() < deadline:
+        while 'lost' not in states and time.monotonic() < deadline:
             time.sleep(0.05)
-    assert set(states) == {'skipped'}
+    assert set(states) == {'skipped', 'lost'}  # without depth a lens may be covered
     assert node.stop() == 0  # nothing crashed
     assert node.text().count('expected a depth image of 64x48') == 1  # one message, not one each
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -15,14 +16,18 @@ import pytest
 pytest.importorskip('rclpy', reason='needs rclpy')
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 
+from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
 from geometry_msgs.msg import PoseStamped  # noqa: E402
 from graph_processes import Graph, Running  # noqa: E402
+from rcl_interfaces.srv import SetParameters  # noqa: E402
 from rclpy.node import Node  # noqa: E402
+from rclpy.parameter import Parameter  # noqa: E402
 from rclpy.subscription import Subscription  # noqa: E402
 from sensor_msgs.msg import CameraInfo, Image  # noqa: E402
 from std_srvs.srv import SetBool, Trigger  # noqa: E402
 
 from bdgs_ros.bridge import conversions, topics  # noqa: E402
+from bdgs_ros.core import se3  # noqa: E402
 from bdgs_ros.core.config import BdgsConfig, with_values  # noqa: E402
 from bdgs_ros.core.types import StampedPose, TrackingStatus, Trajectory  # noqa: E402
 from bdgs_ros.data.bag_recording import BagSequence  # noqa: E402
@@ -31,6 +36,7 @@ from bdgs_ros.pipeline import BdgsSlam  # noqa: E402
 
 HALF = 10  # frames that the map is made of
 TURNED_AWAY = '0 0 0 0 0.7071 0 0.7071'  # by 90 degrees: nothing of the map is seen there
+LATE = 15  # the camera is 1.6 cm from the origin then
 DEATH = 16  # frames until tracking is killed: the camera is 2 cm from the origin then
 
 
@@ -174,6 +180,97 @@ def test_a_camera_that_is_elsewhere_in_the_map_is_found(
         index = stamps.index(int(stamp_ns))
         if index < HALF:
             assert position == pytest.approx(expected[index][:3, 3], abs=0.02)
+
+
+def test_a_map_that_is_loaded_at_run_time_is_where_tracking_looks_for_the_camera(
+    graph: Graph, ros: Callable, bag: Path, settings: dict[str, object], tmp_path: Path
+) -> None:
+    """The places are those of the file: the view from start_pose shows nothing of the map."""
+    wide = {**settings, 'mapping__width': 320}
+    slam, sequence = BdgsSlam(config_of(wide)), BagSequence(bag)
+    for i in range(HALF):
+        slam.process(sequence[i])
+    slam.mapper.save(tmp_path / 'map.ply')
+    true = [pose.T_world_camera for pose in sequence.ground_truth.poses]
+    expected = [(se3.inverse(true[0]) @ pose)[:3, 3] for pose in true]
+    stamps = [frame.stamp_ns for frame in sequence]
+    found: dict[int, np.ndarray] = {}
+    states: list[str] = []
+    node = graph.node(
+        'slam_node', bag=bag, mode='lockstep', paused=True, lockstep_timeout_s=5.0,
+        start=seconds_in(bag, LATE), output=tmp_path / 'out', **wide,
+    )  # fmt: skip
+    node.wait_for('playing', 90.0)
+    with ros() as me:
+
+        def keep(message: PoseStamped) -> None:
+            pose = conversions.pose_from_message(message.pose)
+            found[conversions.stamp_ns(message)] = pose[:3, 3]
+
+        def note(message: DiagnosticArray) -> None:
+            states.append(message.status[0].message)
+
+        readers = [
+            me.create_subscription(PoseStamped, topics.POSE, keep, topics.RELIABLE),
+            me.create_subscription(DiagnosticArray, topics.STATUS, note, topics.RELIABLE),
+        ]
+        wait_until_connected(readers)
+        step = stepper(me, states)
+        step(1)
+        assert np.linalg.norm(found[stamps[LATE]]) < 1e-6  # a world of its own
+        before = set(found)
+        set_parameters(
+            me, '/mapping_node', map_file=str(tmp_path / 'map.ply'), start_pose=TURNED_AWAY
+        )
+        answer = call(me, Trigger, topics.LOAD_MAP, Trigger.Request())
+        assert answer.success, answer.message
+        step(3)
+        after = [k for k in range(LATE, len(stamps)) if stamps[k] in set(found) - before]
+        assert len(after) >= 2, (states, node.text())
+        assert np.linalg.norm(expected[LATE]) > 0.015  # by so much the two worlds differ
+        for k in after:
+            assert np.linalg.norm(found[stamps[k]] - expected[k]) < 0.006
+        missing = str(tmp_path / 'none.ply')
+        set_parameters(me, '/mapping_node', map_file=missing)
+        answer = call(me, Trigger, topics.LOAD_MAP, Trigger.Request())
+        assert not answer.success and 'none.ply' in answer.message
+        step(1)
+        assert states[-1] == 'ok'  # the map that it has is still the one it had
+    assert 'places to recognise' in node.text()
+
+
+def call(me: Node, kind: type, name: str, request: object) -> object:
+    client = me.create_client(kind, name)
+    assert client.wait_for_service(20.0)
+    done = threading.Event()
+    future = client.call_async(request)
+    future.add_done_callback(lambda _: done.set())
+    assert done.wait(30.0), name
+    return future.result()
+
+
+def set_parameters(me: Node, node: str, **values: str) -> None:
+    parameters = [Parameter(n, value=v).to_parameter_msg() for n, v in values.items()]
+    request = SetParameters.Request(parameters=parameters)
+    answer = call(me, SetParameters, f'{node}/set_parameters', request)
+    assert all(result.successful for result in answer.results)
+
+
+def stepper(me: Node, states: list[str]) -> Callable[[int], None]:
+    """Return what plays so many frames; each has its status at the end."""
+    client = me.create_client(Trigger, topics.REPLAY_STEP)
+    assert client.wait_for_service(20.0)
+
+    def step(count: int) -> None:
+        for _ in range(count):
+            before, deadline = len(states), time.monotonic() + 30
+            client.call_async(Trigger.Request())
+            while len(states) == before:
+                assert time.monotonic() < deadline, states
+                time.sleep(0.01)
+        time.sleep(0.2)  # the pose is on another topic
+
+    return step
 
 
 def seconds_in(bag: Path, index: int) -> float:

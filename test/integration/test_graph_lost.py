@@ -14,9 +14,13 @@ pytestmark = [pytest.mark.ros, pytest.mark.slow]
 
 from graph_processes import Graph  # noqa: E402
 
+from bdgs_ros.core.config import BdgsConfig, with_values  # noqa: E402
+from bdgs_ros.core.types import StampedPose, TrackingStatus, Trajectory  # noqa: E402
+from bdgs_ros.data.bag_recording import BagSequence  # noqa: E402
 from bdgs_ros.data.convert import convert  # noqa: E402
 from bdgs_ros.data.synth.writer import write_recording  # noqa: E402
 from bdgs_ros.data.trajectory_io import read_trajectory  # noqa: E402
+from bdgs_ros.pipeline import BdgsSlam  # noqa: E402
 
 FRAMES = 22
 COVERED = range(8, 14)
@@ -31,9 +35,7 @@ def covered_bag(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[in
         files = sorted((folder / 'synth' / kind).glob('*.png'))
         for i in COVERED:
             image = cv2.imread(str(files[i]), cv2.IMREAD_UNCHANGED)
-            dark = np.zeros_like(image)
-            dark[:20, :20] = 5000 if kind == 'depth' else 0  # no depth at all would be skipped
-            cv2.imwrite(str(files[i]), dark)
+            cv2.imwrite(str(files[i]), np.zeros_like(image))
     convert(folder / 'synth', folder / 'bag')
     truth = read_trajectory(folder / 'synth' / 'groundtruth.txt')
     return folder / 'bag', truth.stamps_ns.tolist()
@@ -56,6 +58,27 @@ def test_a_covered_lens_in_the_graph(
     assert found.stamps_ns.tolist() == expected
     report = json.loads((out / 'metrics.json').read_text())
     assert report['nodes']['tracking']['frames_lost'] == str(len(COVERED))
+    assert report['nodes']['tracking']['frames_without_depth'] == str(len(COVERED))
     assert report['metrics']['frames_lost']['value'] == len(COVERED)
     assert report['metrics']['ate_rmse']['value'] < 2.0
     assert f'{len(COVERED)} lost' in slam.text()
+    assert 'received an image of zeros or NaN' in slam.text()
+    offline = without_ros(bag, settings)
+    assert found.stamps_ns.tolist() == offline.stamps_ns.tolist()
+    assert found.positions == pytest.approx(offline.positions, abs=1e-4)
+
+
+def without_ros(bag: Path, settings: dict[str, object]) -> Trajectory:
+    values = {name.replace('__', '.'): value for name, value in settings.items()}
+    slam = BdgsSlam(with_values(BdgsConfig(), values))
+    results = [slam.process(frame).tracking for frame in BagSequence(bag)]
+    mapped = slam.mapper.history.stamps_ns
+    assert mapped == [r.stamp_ns for r in results if r.is_keyframe]
+    assert not {results[i].stamp_ns for i in COVERED} & set(mapped)
+    return Trajectory(
+        tuple(
+            StampedPose(r.stamp_ns, r.T_world_camera)
+            for r in results
+            if r.status is TrackingStatus.OK
+        )
+    )

@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 
 from bdgs_ros.bench.harness import Cell, Options, run_bench, to_markdown
-from bdgs_ros.core.errors import DatasetError
+from bdgs_ros.cli.main import main
+from bdgs_ros.core.errors import ConfigError, DatasetError
 
 
 class FakeBench:
@@ -193,11 +194,38 @@ def test_other_settings_are_other_cells(options):
 
 
 @pytest.mark.parametrize(
-    ('only', 'count'), [(['a'], 2), (['y'], 2), (['a/x/0'], 1), (['a', 'b'], 4), (['c*'], 0)]
+    ('only', 'count'), [(['a'], 2), (['y'], 2), (['a/x/0'], 1), (['a', 'b'], 4)]
 )
 def test_only_chooses_by_sequence_configuration_or_label(options, only, count):
     bench = FakeBench()
     assert len(run_bench(bench, options, only)['rows']) == count == len(bench.ran)
+
+
+@pytest.mark.parametrize('only', [['c*'], ['a', 'b/z/0']])
+def test_a_pattern_that_matches_nothing_is_refused_with_what_it_could_match(options, only):
+    bench = FakeBench()
+    with pytest.raises(ConfigError) as error:
+        run_bench(bench, options, only)
+    assert f"--only '{only[-1]}' matches none of the 4 cells of bench fake" in str(error.value)
+    assert 'sequences a, b and the configurations x, y' in str(error.value)
+    assert "'a/x/0'" in str(error.value)
+    assert not bench.ran and not options.work.exists()
+
+
+def test_of_many_names_the_likeliest_are_shown(options):
+    bench = FakeBench()
+    names = [f'recording_{i}' for i in range(20)]
+    bench.cells = lambda options: [Cell(name, 'x') for name in [*names, 'walking_xyz']]
+    with pytest.raises(ConfigError, match=r'sequences walking_xyz, recording_0, .*, \.\.\. and'):
+        run_bench(bench, options, ['walkin_xyz*'])
+
+
+def test_the_command_line_refuses_a_pattern_that_matches_nothing(tmp_path, capsys):
+    code = main(['bench', 'recovery', '--only', 'nowhere', '--work', str(tmp_path)])
+    assert code == 2
+    out, err = capsys.readouterr()
+    assert out == ''
+    assert err.startswith("bdgs bench: --only 'nowhere' matches none") and 'black' in err
 
 
 def test_a_failure_stays_in_the_table_and_is_tried_again(options):

@@ -30,6 +30,15 @@ def test_cells_are_told_apart_and_plain_covers_have_one_seed(options: Options) -
     assert len(set(labels)) == len(labels)
     assert {'bonn_crowd_part/jump/0', 'synth_crowd/black/4', 'synth_static/none/4'} <= set(labels)
     assert 'synth_crowd/wall/1' not in labels
+    assert 'synth_crowd/blind/0' in labels
+
+
+@pytest.mark.parametrize('name', ['black', 'grey', 'blind', 'wall'])
+def test_every_cover_lasts_a_second(name: str) -> None:
+    fault = make_fault(Straight(150), name, 0)
+    assert (fault.start, fault.stop) == (75, 106)
+    has_depth = bool(fault.frames[fault.start].depth_m.any())
+    assert has_depth is (name == 'wall')
 
 
 def test_loss_and_recovery_are_timed() -> None:

@@ -92,6 +92,53 @@ def test_a_covered_lens_is_lost_and_found_again(recording: tuple) -> None:
     assert error_m(found, poses, 8) < 0.01
 
 
+def blind(frame: RgbdFrame) -> RgbdFrame:
+    return replace(frame, depth_m=np.zeros_like(frame.depth_m))
+
+
+def test_where_depth_alone_is_lost_colour_tells_the_pose(recording: tuple) -> None:
+    """Keyframes are due all the time, but none can be made: nothing could be aligned to it."""
+    frames, poses = recording
+    config = replace(CONFIG, keyframe=replace(CONFIG.keyframe, max_interval=1))
+    tracker = CameraTracker(config)
+    for frame in frames[:5]:
+        assert tracker.process(frame).is_keyframe
+    results = [tracker.process(blind(frame)) for frame in frames[5:12]]
+    assert all(r.status is TrackingStatus.OK and not r.is_keyframe for r in results)
+    assert max(error_m(r, poses, i) for i, r in enumerate(results, 5)) < 0.01
+    assert tracker.process(frames[12]).is_keyframe
+
+
+@pytest.mark.parametrize('color', [None, 0, 12])
+def test_a_world_begins_with_the_first_frame_that_has_depth(
+    recording: tuple, color: int | None
+) -> None:
+    frames, _ = recording
+    tracker = CameraTracker(CONFIG)
+    covered = [blind(frame) for frame in frames[:3]]
+    if color is not None:
+        covered = [replace(f, color=np.full_like(f.color, color)) for f in covered]
+    for frame in covered:
+        result = tracker.process(frame)
+        assert result.status is TrackingStatus.LOST and not result.is_keyframe
+    first = tracker.process(frames[3])
+    assert first.status is TrackingStatus.OK and first.is_keyframe
+    np.testing.assert_array_equal(first.T_world_camera, np.eye(4))
+
+
+def test_a_lost_camera_is_not_found_without_depth(recording: tuple) -> None:
+    """What it would be recognised by is less than usual, and mapping could show nothing."""
+    frames, _ = recording
+    tracker = CameraTracker(CONFIG)
+    for frame in frames[:5]:
+        tracker.process(frame)
+    dark = np.zeros_like(frames[0].color)
+    tracker.process(replace(blind(frames[5]), color=dark))
+    waiting = [tracker.process(blind(frame)) for frame in frames[6:9]]
+    assert all(r.status is TrackingStatus.LOST for r in waiting)
+    assert tracker.process(frames[9]).status is TrackingStatus.OK
+
+
 def test_a_frame_that_is_all_people_is_lost(recording: tuple) -> None:
     frames, _ = recording
     tracker = CameraTracker(CONFIG)

@@ -76,3 +76,10 @@ def test_a_short_recording_cannot_jump() -> None:
     sequence = Straight(60)
     with pytest.raises(DatasetError, match='60 frames are too few'):
         faults.choose_jump(sequence.ground_truth, sequence.stamps_ns)
+
+
+def test_where_depth_alone_is_lost_the_colour_stays() -> None:
+    faulty = faults.covered(Straight(90), 30, 1.0, faults.blind)
+    without = [i for i, frame in enumerate(faulty) if not frame.depth_m.any()]
+    assert without == list(faulty.covered)
+    assert all((faulty[i].color == i).all() for i in without)

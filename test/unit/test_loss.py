@@ -61,3 +61,18 @@ def test_sure_is_as_good_as_before_the_loss() -> None:
     assert not test.is_sure(aligned(0.75))
     test.reset()
     assert test.is_sure(aligned(0.75))
+
+
+@pytest.mark.parametrize(
+    ('depth', 'dynamic', 'expected'),
+    [(0.5, 0.0, True), (0.02, 0.0, False), (0.0, 0.0, False), (1.0, 1.0, False), (1.0, 0.5, True)],
+)
+def test_frames_that_nothing_can_be_aligned_to(
+    depth: float, dynamic: float, expected: bool
+) -> None:
+    """Shares of the width that have depth, and that move."""
+    depth_m = np.full((100, 400), np.nan, np.float32)
+    depth_m[:, : round(400 * depth)] = 2.0
+    p_dynamic = np.zeros((100, 400), np.uint8)
+    p_dynamic[:, : round(400 * dynamic)] = 255
+    assert LossTest(LossConfig()).can_be_aligned_to(depth_m, p_dynamic) is expected
