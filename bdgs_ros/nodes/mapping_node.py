@@ -228,18 +228,24 @@ class MappingNode(GraphNode):
         return Keyframe(frame, conversions.pose_from_message(message.pose), labels)
 
     def _labels_of(self, frame: RgbdFrame) -> ProbabilityImage:
-        """Return the labels of a frame; in real time the nearest older ones will do."""
+        """Return the labels of a frame; in real time the nearest ones will do."""
         if self._mapper.frozen:  # they would change nothing
             return np.zeros(frame.camera.shape, np.uint8)
-        present = self.count_publishers(topics.LABELS) > 0
-        limit_s = self._config.lockstep_timeout_s if self._config.lockstep else _LABELS_WAIT_S
-        message = self._labels.wait(frame.stamp_ns, limit_s if present else 0.0)
-        if message is None:
-            message = self._labels.newest(frame.stamp_ns, _MAX_LABEL_AGE_NS)
+        message = self._find_labels(frame.stamp_ns)
         if message is None:
             self._health.counts['keyframes_without_labels'] += 1
             return np.zeros(frame.camera.shape, np.uint8)
         return conversions.probability_from_message(message, topics.LABELS)
+
+    def _find_labels(self, stamp_ns: int) -> CdrImage | None:
+        """Find labels: detection passes images over in real time, so newer ones end the wait."""
+        present = self.count_publishers(topics.LABELS) > 0
+        if self._config.lockstep and present:
+            found = self._labels.wait(stamp_ns, self._config.lockstep_timeout_s)
+            if found is not None:
+                return found
+        wait_s = _LABELS_WAIT_S if present and not self._config.lockstep else 0.0
+        return self._labels.nearest(stamp_ns, _MAX_LABEL_AGE_NS, wait_s)
 
     def _on_idle(self) -> None:
         """Between keyframes: show the map, and save it if that is due."""
