@@ -138,10 +138,38 @@ def take_keyframe(
     """
     if mapper.frozen:
         return mapper.process(keyframe)
-    stamp_ns, tracked = keyframe.frame.stamp_ns, keyframe.T_world_camera
+    adjust(back_end, mapper, keyframe)
+    return into_map(back_end, mapper, keyframe, early)
+
+
+def adjust(back_end: BackEnd, mapper: Mapper, keyframe: Keyframe) -> None:
+    """
+    Make a keyframe agree with the earlier ones: `mapper.keyframe_poses` says where all are now.
+
+    Parameters
+    ----------
+    back_end, mapper : BackEnd, Mapper
+        They are changed.
+    keyframe : Keyframe
+        As tracking gave it, newer than all others. It is not in the map yet.
+
+    """
+    stamp_ns = keyframe.frame.stamp_ns
     transforms = back_end.process(keyframe, mapper.keyframe_poses())
+    mapper.announce(stamp_ns, keyframe.T_world_camera)
     mapper.correct_poses(transforms)
     mapper.readout_s = back_end.readout_s
-    corrected = transforms[stamp_ns] @ tracked if transforms else tracked
+
+
+def into_map(
+    back_end: BackEnd, mapper: Mapper, keyframe: Keyframe, early: Answer | None = None
+) -> ModelView | None:
+    """
+    Take a keyframe into the map after `adjust`; newer ones may have been adjusted since.
+
+    Parameters and result are those of `take_keyframe`.
+    """
+    stamp_ns = keyframe.frame.stamp_ns
+    pose = mapper.keyframe_poses()[stamp_ns]
     frame, p_dynamic = straightened(keyframe.frame, keyframe.p_dynamic, back_end.sweep(stamp_ns))
-    return mapper.process(Keyframe(frame, corrected, p_dynamic), tracked, early)
+    return mapper.process(Keyframe(frame, pose, p_dynamic), early)

@@ -44,12 +44,12 @@ def two(held: float = 0.0) -> tuple[History, list[MapKeyframe]]:
     """Keyframes at 0 and 100 ns; the first had been moved by `held` when its view was given."""
     history = History()
     first = keyframe(0, 0, np.eye(4))
-    history.add(first)
+    history.add(0, first.T_world_camera)
     first.T_world_camera = shifted(held)
-    history.publish(first)
+    history.publish(0, first.T_world_camera)
     second = keyframe(1, 100, online(100).poses[0].T_world_camera)
-    history.add(second)
-    history.publish(second)
+    history.add(100, second.T_world_camera)
+    history.publish(100, second.T_world_camera)
     return history, [first, second]
 
 
@@ -131,5 +131,5 @@ def test_a_new_run_is_not_corrected_by_the_keyframes_of_an_earlier_one() -> None
     assert history.stamps_ns == [0, 100]
     history.refresh(keyframes)
     assert moved(history, 0, 100) == [0, 0]
-    history.add(keyframe(2, 500, np.eye(4)))
+    history.add(500, np.eye(4))
     assert history.stamps_ns == [0, 100, 500]
