@@ -3,15 +3,16 @@ What became of the keyframes: how late corrections reach the frames between them
 
 Frames are tracked relative to a keyframe, from where tracking believes that to be. When the map
 later moves the keyframe, they move with it; between two keyframes the corrections of both are
-blended. What tracking believes changes when mapping answers, in real time between frames of its
-keyframes: those before the answer are corrected by all of it, those after by what came later.
+blended. Tracking itself moves when mapping answers, in real time amid the frames of a keyframe:
+those before that are corrected by all of it, those after by what came later.
 """
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
+from bisect import bisect_right
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -42,9 +43,8 @@ class History:
     def __init__(self) -> None:
         self._anchors: dict[int, Anchor] = {}
         self._earlier_ns: list[int] = []
-        self._tracked_ns: int | None = None
-        self._told_ns: list[int] = []  # newest frame when tracking was told, and
-        self._told: list[Pose] = []  # by what it moved all that it tracked since, T_new_old
+        # By what tracking moved all that it knew, T_new_old, and the first frame after that.
+        self._moves: list[tuple[int, Pose]] = []
 
     @property
     def stamps_ns(self) -> list[int]:
@@ -54,7 +54,7 @@ class History:
     def begin_run(self) -> None:
         """Keep of earlier runs nothing but the stamps: their poses correct no new frame."""
         self._earlier_ns, self._anchors = self.stamps_ns, {}
-        self._tracked_ns, self._told_ns, self._told = None, [], []
+        self._moves = []
 
     @property
     def poses(self) -> dict[int, Pose]:
@@ -75,16 +75,9 @@ class History:
             if anchor is not None:
                 anchor.final = se3.orthonormalise(T_new_old @ anchor.final)
 
-    def note_tracked(self, stamp_ns: int) -> None:
-        """Note that frames up to here are tracked; unless told, those up to the last keyframe."""
-        self._tracked_ns = stamp_ns
-
-    def publish(self, stamp_ns: int, pose: Pose) -> None:
-        """Note that tracking now learns where a keyframe is; it moves all since along."""
-        now_ns = max(self._tracked_ns or stamp_ns, stamp_ns, *self._told_ns[-1:])
-        believed = self._told_between(stamp_ns, now_ns + 1) @ self._anchors[stamp_ns].online
-        self._told_ns.append(now_ns)
-        self._told.append(se3.orthonormalise(pose @ se3.inverse(believed)))
+    def note_move(self, stamp_ns: int, T_new_old: Pose) -> None:
+        """Note that tracking moved everything before a frame: it learnt where keyframes are."""
+        self._moves.append((stamp_ns, T_new_old))
 
     def refresh(self, keyframes: Iterable[MapKeyframe]) -> None:
         """Take over the present poses and exposures."""
@@ -143,14 +136,15 @@ class History:
     def _held(self, keyframe_ns: int, stamp_ns: int) -> Pose:
         """Return T_final_online at a time that holds the motion since a keyframe."""
         own = self._anchors[keyframe_ns]
-        believed = self._told_between(keyframe_ns, stamp_ns) @ own.online
+        believed = self._moved_between(keyframe_ns, stamp_ns) @ own.online
         return own.final @ se3.inverse(believed)
 
-    def _told_between(self, keyframe_ns: int, stamp_ns: int) -> Pose:
+    def _moved_between(self, keyframe_ns: int, stamp_ns: int) -> Pose:
         """Return by what tracking moved a keyframe before it tracked a later frame."""
-        first, last = (bisect_left(self._told_ns, time_ns) for time_ns in (keyframe_ns, stamp_ns))
+        first = bisect_right(self._moves, keyframe_ns, key=itemgetter(0))
+        last = bisect_right(self._moves, stamp_ns, key=itemgetter(0))
         moved = se3.identity()
-        for T_new_old in self._told[first:last]:
+        for _, T_new_old in self._moves[first:last]:
             moved = T_new_old @ moved
         return moved
 
@@ -173,11 +167,11 @@ class History:
             }
             for stamp_ns, anchor in self._anchors.items()
         ]
-        told = [
-            {'stamp_ns': stamp_ns, 'T_new_old': T.tolist()}
-            for stamp_ns, T in zip(self._told_ns, self._told, strict=True)
+        moves = [
+            {'stamp_ns': stamp_ns, 'T_new_old': T_new_old.tolist()}
+            for stamp_ns, T_new_old in self._moves
         ]
-        return {'anchors': anchors, 'told': told, 'earlier_ns': self._earlier_ns}
+        return {'anchors': anchors, 'moves': moves, 'earlier_ns': self._earlier_ns}
 
     @classmethod
     def from_document(cls, document: dict[str, Any]) -> History:
@@ -188,7 +182,7 @@ class History:
             online, final = (np.array(entry[n], float).reshape(4, 4) for n in _POSES)
             exposure = np.array(entry['exposure'], np.float32).reshape(2)
             history._anchors[int(entry['stamp_ns'])] = Anchor(online, final, exposure)
-        for entry in document['told']:
-            history._told_ns.append(int(entry['stamp_ns']))
-            history._told.append(np.array(entry['T_new_old'], float).reshape(4, 4))
+        for entry in document['moves']:
+            T_new_old = np.array(entry['T_new_old'], float).reshape(4, 4)
+            history.note_move(int(entry['stamp_ns']), T_new_old)
         return history

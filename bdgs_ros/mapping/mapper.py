@@ -101,6 +101,11 @@ class Mapper:
         self._index_of: dict[int, int] = {}  # of this run's keyframes, by stamp
         self._rng = np.random.default_rng(self._config.seed)
 
+    @property
+    def grows(self) -> bool:
+        """Whether keyframes change the map."""
+        return self._config.enabled and not self.frozen
+
     def announce(self, stamp_ns: int, T_world_camera: Pose) -> None:
         """Take the pose of a new keyframe, as tracking gave it; it moves with `correct_poses`."""
         self.history.add(stamp_ns, T_world_camera)
@@ -149,9 +154,8 @@ class Mapper:
         return self._answer(current)
 
     def _answer(self, current: MapKeyframe) -> ModelView:
-        """Render what tracking gets, and note that it does."""
+        """Render what tracking gets."""
         pose, camera = current.T_world_camera, current.levels[0].camera
-        self.history.publish(current.stamp_ns, pose)
         return self.view(current.stamp_ns, pose, camera, current.exposure)
 
     def _straighten(self, fine: Keyframe, small: Keyframe) -> tuple[Keyframe, Keyframe]:

@@ -6,7 +6,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from std_msgs.msg import Bool, Empty
 
 from bdgs_ros.back_end.back_end import BackEnd
 from bdgs_ros.bridge import conversions, parameters, topics
+from bdgs_ros.bridge.adjuster import Adjuster
 from bdgs_ros.bridge.cdr_image import CdrImage, image_from_cdr
 from bdgs_ros.bridge.frames import FrameDecoder, FrameSource, RawFrame
 from bdgs_ros.bridge.health import Health
@@ -35,7 +36,6 @@ from bdgs_ros.core.errors import BdgsError, ConfigError
 from bdgs_ros.core.types import (
     NO_KEYFRAME_NS,
     Keyframe,
-    ModelView,
     Pose,
     ProbabilityImage,
     RgbdFrame,
@@ -45,7 +45,7 @@ from bdgs_ros.core.types import (
 from bdgs_ros.data.trajectory_io import parse_pose, write_trajectory
 from bdgs_ros.mapping.entrance import check_entrance, entrance
 from bdgs_ros.mapping.mapper import Mapper
-from bdgs_ros.pipeline import take_keyframe
+from bdgs_ros.pipeline import Adjustment
 
 _FRAME_WAIT_S = 2.0
 _PENDING_S = 30.0
@@ -68,7 +68,13 @@ class MappingNode(GraphNode):
         self._health = Health(self, 'mapping')
         self._mapper = Mapper(config.mapping, config.belief, self._is_hurried)
         self._start_pose = _parse_start_pose(config.start_pose)
-        self._back_end = BackEnd(config.back_end)
+        self._back_end = Adjuster(
+            BackEnd(config.back_end),
+            self._mapper,
+            self._publish_keyframes,
+            lambda view: self._models.publish(view.stamp_ns, view),
+            at_once=not config.lockstep,
+        )
         self._tracked: deque[StampedPose] = deque(maxlen=_POSES_KEPT)
         self._lock = threading.Lock()  # of the mapper: worker and services
         self._version = 0
@@ -81,12 +87,16 @@ class MappingNode(GraphNode):
         self._poses: list[StampedPose] = []
         self._newest: RawFrame | None = None
         self._is_asked = False
+        self._adjusting: Worker[Callable[[], None]] = Worker(
+            lambda task: task(), self._health.error, None, nice=config.back_end_nice
+        )
         self._worker: Worker[Callable[[], None]] = Worker(
             lambda task: task(),
             self._health.error,
             None if config.lockstep else config.keyframe_queue,
             self._on_idle,
             nice=config.mapping_nice,
+            source=self._adjusting,
         )
         self._subscribe()
         self._load_at_start()
@@ -102,6 +112,7 @@ class MappingNode(GraphNode):
             PoseStamped, topics.KEYFRAME, self._queue_keyframe, topics.RELIABLE
         )
         self.create_subscription(PoseStamped, topics.POSE, self._keep_pose, topics.RELIABLE)
+        self.create_subscription(PoseStamped, topics.MOVE, self._note_move, topics.RELIABLE)
         self.create_subscription(
             Empty, topics.RESET_EVENT, lambda _: self._forget(), topics.RELIABLE
         )
@@ -137,6 +148,10 @@ class MappingNode(GraphNode):
         if self._mapper.frozen:
             self._worker.wake()
 
+    def _note_move(self, message: PoseStamped) -> None:
+        T_new_old = conversions.motion_from_message(message)
+        self._mapper.history.note_move(conversions.stamp_ns(message), T_new_old)
+
     def _on_request(self) -> None:
         self._is_asked = True
         self._answer_request()
@@ -170,48 +185,71 @@ class MappingNode(GraphNode):
     def _queue_keyframe(self, message: PoseStamped) -> None:
         # Its images are taken along now: they may be forgotten when its turn comes.
         raw = self._frames.get(conversions.stamp_ns(message))
-        self._worker.put(partial(self._on_keyframe, message, raw))
+        self._adjusting.put(partial(self._on_keyframe, message, raw))
 
     def _on_keyframe(self, message: PoseStamped, raw: RawFrame | None) -> None:
+        """Have the back end look at a keyframe, then hand it over to the map."""
         stamp_ns = conversions.stamp_ns(message)
-        view = None
         try:
             keyframe = self._assemble(message, raw or self._wait_frame(stamp_ns))
-            if keyframe is not None:
-                view = self._map(keyframe)
+        except BdgsError as error:
+            keyframe = None
+            self._health.error(error)
+        if keyframe is None:
+            self._answer_nothing(stamp_ns)
+        elif not self._mapper.grows:
+            self._worker.put(partial(self._show_map, keyframe))
+        else:
+            with self._health.timed('back_end'):
+                adjustment = self._back_end.adjust(keyframe, self._tracked_until(stamp_ns))
+            if adjustment is not None:
+                self._worker.put(partial(self._map, keyframe, adjustment))
+            self._health.counts['keyframes_dropped'] = self._worker.dropped
+
+    def _answer_nothing(self, stamp_ns: int) -> None:
+        """Tell tracking, which waits in lockstep, not to."""
+        if self._config.lockstep:
+            self._models.publish(stamp_ns, None)
+
+    def _map(self, keyframe: Keyframe, adjustment: Adjustment) -> None:
+        answered = False
+        try:
+            with self._health.timed('mapping'), self._lock:
+                answered = self._back_end.into_map(keyframe, adjustment)
+                self._version += 1
         except BdgsError as error:
             self._health.error(error)
-        finally:  # an empty answer tells tracking, which waits in lockstep, not to
-            if view is not None or self._config.lockstep:
-                self._models.publish(stamp_ns, view)
-        self._publish_keyframes(stamp_ns)
-        self._health.counts['gaussians'] = len(self._mapper.map)
-        self._health.counts['keyframes_dropped'] = self._worker.dropped
+        if not answered:
+            self._answer_nothing(adjustment.stamp_ns)
+        self._count_keyframe()
 
-    def _map(self, keyframe: Keyframe) -> ModelView | None:
+    def _show_map(self, keyframe: Keyframe) -> None:
+        """Answer a keyframe with a view of a map that does not change."""
         with self._health.timed('mapping'), self._lock:
-            stamp_ns = keyframe.frame.stamp_ns
-            self._observe_until(stamp_ns)
-            early = None if self._config.lockstep else partial(self._models.publish, stamp_ns)
-            view = take_keyframe(self._back_end, self._mapper, keyframe, early)
-            self._version += not self._mapper.frozen
+            view = self._mapper.process(keyframe)
+        self._models.publish(keyframe.frame.stamp_ns, view)
+        self._count_keyframe()
+
+    def _count_keyframe(self) -> None:
         self._health.counts['keyframes'] += 1
-        return view
+        self._health.counts['gaussians'] = len(self._mapper.map)
 
-    def _publish_keyframes(self, stamp_ns: int) -> None:
+    def _publish_keyframes(self, poses: Mapping[int, Pose]) -> None:
         """Say where the keyframes are now: a closed loop moves those of long ago."""
-        poses = [StampedPose(*item) for item in sorted(self._mapper.keyframe_poses().items())]
+        stamped = [StampedPose(*item) for item in sorted(poses.items())]
         frame = self._config.map_frame
-        self._keyframes.publish(conversions.path_message(poses, stamp_ns, frame))
+        self._keyframes.publish(conversions.path_message(stamped, stamped[-1].stamp_ns, frame))
 
-    def _observe_until(self, stamp_ns: int) -> None:
-        """Give the back end the poses of frames up to a keyframe; it knows that one itself."""
+    def _tracked_until(self, stamp_ns: int) -> list[StampedPose]:
+        """Take the poses of frames up to a keyframe; the back end knows that one itself."""
+        found = []
         while self._tracked and self._tracked[0].stamp_ns < stamp_ns:
-            tracked = self._tracked.popleft()
-            self._back_end.observe(tracked.stamp_ns, tracked.T_world_camera)
+            found.append(self._tracked.popleft())
+        return found
 
     def _is_hurried(self) -> bool:
-        return not self._config.lockstep and self._worker.waiting > 0
+        waiting = self._adjusting.waiting + self._worker.waiting
+        return not self._config.lockstep and waiting > 0
 
     def _wait_frame(self, stamp_ns: int) -> RawFrame | None:
         timeout_s = self._config.lockstep_timeout_s if self._config.lockstep else _FRAME_WAIT_S
@@ -263,6 +301,9 @@ class MappingNode(GraphNode):
         self._frames.clear()
         self._poses = []
         self._newest = None
+        self._tracked.clear()
+        self._back_end.forget()
+        self._adjusting.restart(self._back_end.reset)
         self._worker.restart(self._start_over)
 
     def _start_over(self) -> None:
@@ -270,8 +311,6 @@ class MappingNode(GraphNode):
             if not self._mapper.frozen:  # a map to localise in outlives the camera's jumps
                 self._mapper.reset()
                 self._version += 1
-            self._back_end.reset()
-            self._tracked.clear()
         self._output.forget()
 
     def _map_file(self) -> Path:
@@ -332,6 +371,7 @@ class MappingNode(GraphNode):
     def close(self) -> None:
         """Stop working."""
         self._side.stop()
+        self._adjusting.stop()
         self._worker.stop()
 
 

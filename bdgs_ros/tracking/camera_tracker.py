@@ -77,6 +77,7 @@ class CameraTracker:
         self._keyframe: Reference | None = None
         self._model: Reference | None = None
         self._tracked: dict[int, Pose] = {}  # keyframes whose view has not come yet
+        self._move: Pose | None = None  # of all that is known, since the last frame
         self._is_lost = False
         self._hypothesis: Hypothesis | None = None
         self.evidence: Evidence | None = None
@@ -166,8 +167,15 @@ class CameraTracker:
         if np.array_equal(new, self._keyframe.T_world_camera):
             return
         self._hypothesis = None
-        self._motion.move(se3.orthonormalise(new @ se3.inverse(self._keyframe.T_world_camera)))
+        T_new_old = se3.orthonormalise(new @ se3.inverse(self._keyframe.T_world_camera))
+        self._motion.move(T_new_old)
+        self._move = T_new_old if self._move is None else T_new_old @ self._move
         self._keyframe = replace(self._keyframe, T_world_camera=new)
+
+    def take_move(self) -> Pose | None:
+        """Return by what the present has been moved since the last call, T_new_old in world."""
+        move, self._move = self._move, None
+        return move
 
     def process(self, frame: RgbdFrame, labels: Labels | None = None) -> TrackingResult:
         """

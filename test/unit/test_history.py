@@ -46,10 +46,9 @@ def two(held: float = 0.0) -> tuple[History, list[MapKeyframe]]:
     first = keyframe(0, 0, np.eye(4))
     history.add(0, first.T_world_camera)
     first.T_world_camera = shifted(held)
-    history.publish(0, first.T_world_camera)
+    history.note_move(1, shifted(held))
     second = keyframe(1, 100, online(100).poses[0].T_world_camera)
     history.add(100, second.T_world_camera)
-    history.publish(100, second.T_world_camera)
     return history, [first, second]
 
 
@@ -74,6 +73,15 @@ def test_what_tracking_already_knew_is_not_added_twice() -> None:
     at_keyframe, later = moved(history, 0, 50)
     assert at_keyframe == pytest.approx(0.3)
     assert later == pytest.approx(0.0, abs=1e-9)
+
+
+def test_frames_before_a_late_answer_are_corrected_by_all_of_it() -> None:
+    """Tracking learnt at 60 ns that the keyframe at 0 is 0.3 further; mapping knows it now."""
+    history, keyframes = two()
+    keyframes[0].T_world_camera = shifted(0.3)
+    history.note_move(60, shifted(0.3))
+    history.refresh(keyframes)
+    assert moved(history, 0, 59, 60, 99) == pytest.approx([0.3, 0.3, 0, 0], abs=1e-9)
 
 
 def test_frames_before_the_first_keyframe_move_with_it() -> None:
