@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
 
 from bdgs_ros.back_end.back_end import BackEnd
 from bdgs_ros.core import se3
@@ -21,7 +25,7 @@ from bdgs_ros.core.types import (
 from bdgs_ros.detection.detector import Detector, LateDetector
 from bdgs_ros.detection.stage import DetectionStage
 from bdgs_ros.mapping.entrance import check_entrance, entrance
-from bdgs_ros.mapping.mapper import Answer, Mapper
+from bdgs_ros.mapping.mapper import Mapper
 from bdgs_ros.tracking.camera_tracker import CameraTracker
 from bdgs_ros.tracking.shutter import straightened
 
@@ -98,6 +102,9 @@ class BdgsSlam:
     def process(self, frame: RgbdFrame) -> FrameResult:
         """Take the next frame: who moves, where is the camera, what does the world look like."""
         labels = self.detection.process(frame)
+        moved = self.tracker.take_move()
+        if moved is not None:
+            self.mapper.history.note_move(frame.stamp_ns, moved)
         tracking = self.tracker.process(frame, labels)
         if tracking.status is TrackingStatus.OK:
             self.back_end.observe(frame.stamp_ns, tracking.T_world_camera)
@@ -115,9 +122,7 @@ class BdgsSlam:
         self.mapper.reset()
 
 
-def take_keyframe(
-    back_end: BackEnd, mapper: Mapper, keyframe: Keyframe, early: Answer | None = None
-) -> ModelView | None:
+def take_keyframe(back_end: BackEnd, mapper: Mapper, keyframe: Keyframe) -> ModelView | None:
     """
     Make a keyframe agree with the earlier ones, then take it into the map.
 
@@ -127,8 +132,6 @@ def take_keyframe(
         They are changed.
     keyframe : Keyframe
         As tracking gave it.
-    early : callable, optional
-        Called with a first view, long before the optimised one is there.
 
     Returns
     -------
@@ -136,12 +139,49 @@ def take_keyframe(
         See `Mapper.process`. Its pose has the corrections, and tracking follows it.
 
     """
-    if mapper.frozen:
+    if not mapper.grows:
         return mapper.process(keyframe)
-    stamp_ns, tracked = keyframe.frame.stamp_ns, keyframe.T_world_camera
-    transforms = back_end.process(keyframe, mapper.keyframe_poses())
-    mapper.correct_poses(transforms)
-    mapper.readout_s = back_end.readout_s
-    corrected = transforms[stamp_ns] @ tracked if transforms else tracked
-    frame, p_dynamic = straightened(keyframe.frame, keyframe.p_dynamic, back_end.sweep(stamp_ns))
-    return mapper.process(Keyframe(frame, corrected, p_dynamic), tracked, early)
+    adjustment = adjust(back_end, keyframe, mapper.keyframe_poses())
+    adjustment.apply(mapper)
+    return mapper.process(adjustment.ready(keyframe, mapper))
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """What the back end says when a keyframe comes."""
+
+    stamp_ns: int
+    tracked: Pose
+    """`T_world_camera` of the keyframe as tracking gave it."""
+    transforms: dict[int, Pose]
+    """See `BackEnd.process`."""
+    readout_s: float
+    sweep: NDArray[np.float64]
+    """Motion while the keyframe was read out, (rho, phi) in its frame, [6]."""
+
+    def moved(self, poses: Mapping[int, Pose]) -> dict[int, Pose]:
+        """Return poses of keyframes by stamp after this, the new one with them."""
+        return {
+            stamp_ns: self.transforms[stamp_ns] @ pose if stamp_ns in self.transforms else pose
+            for stamp_ns, pose in {**poses, self.stamp_ns: self.tracked}.items()
+        }
+
+    def apply(self, mapper: Mapper) -> None:
+        """Move the map and the keyframes; the new one is not in the map yet."""
+        mapper.announce(self.stamp_ns, self.tracked)
+        mapper.correct_poses(self.transforms)
+        mapper.readout_s = self.readout_s
+
+    def ready(self, keyframe: Keyframe, mapper: Mapper) -> Keyframe:
+        """Return the new keyframe where it is now, as a global shutter had seen it."""
+        pose = mapper.keyframe_poses()[self.stamp_ns]
+        frame, p_dynamic = straightened(keyframe.frame, keyframe.p_dynamic, self.sweep)
+        return Keyframe(frame, pose, p_dynamic)
+
+
+def adjust(back_end: BackEnd, keyframe: Keyframe, poses: Mapping[int, Pose]) -> Adjustment:
+    """Ask the back end about a keyframe newer than all others, which are at `poses` now."""
+    stamp_ns = keyframe.frame.stamp_ns
+    transforms = back_end.process(keyframe, poses)
+    sweep = back_end.sweep(stamp_ns)
+    return Adjustment(stamp_ns, keyframe.T_world_camera, transforms, back_end.readout_s, sweep)

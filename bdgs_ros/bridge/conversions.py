@@ -141,6 +141,16 @@ def pose_stamped(T_world_camera: Pose, at_ns: int, map_frame: str) -> PoseStampe
     return PoseStamped(header=header(at_ns, map_frame), pose=pose_to_message(T_world_camera))
 
 
+def motion_stamped(T_new_old: Pose, at_ns: int, map_frame: str) -> PoseStamped:
+    """Stamp a motion of core's world, as one of `map`."""
+    return pose_stamped(T_new_old @ T_WORLD_MAP, at_ns, map_frame)
+
+
+def motion_from_message(message: PoseStamped) -> Pose:
+    """Undo `motion_stamped`."""
+    return np.asarray(pose_from_message(message.pose) @ T_MAP_WORLD)
+
+
 def path_message(poses: Iterable[StampedPose], at_ns: int, map_frame: str) -> Path:
     """Join stamped camera poses to a path."""
     path = Path(header=header(at_ns, map_frame))

@@ -12,7 +12,7 @@ from bdgs_ros.bridge import conversions, topics
 from bdgs_ros.bridge.node_config import TrackingNodeConfig
 from bdgs_ros.bridge.optional import TransformPublisher
 from bdgs_ros.core import se3
-from bdgs_ros.core.types import StampedPose, TrackingResult, Trajectory
+from bdgs_ros.core.types import Pose, StampedPose, TrackingResult, Trajectory
 
 _PATH_POSES = 2000
 
@@ -38,6 +38,7 @@ class PoseOutput:
         self._odometry = node.create_publisher(Odometry, topics.ODOMETRY, topics.RELIABLE)
         self._path = node.create_publisher(Path, topics.PATH, topics.LATCHED)
         self._keyframe = node.create_publisher(PoseStamped, topics.KEYFRAME, topics.RELIABLE)
+        self._move = node.create_publisher(PoseStamped, topics.MOVE, topics.RELIABLE)
         self._transform = TransformPublisher(node, config.publish_tf)
 
     @property
@@ -48,6 +49,10 @@ class PoseOutput:
     def clear(self) -> None:
         """Forget the trajectory."""
         self._poses = []
+
+    def publish_move(self, stamp_ns: int, T_new_old: Pose) -> None:
+        """Say that the poses from a frame on are in a world that has moved."""
+        self._move.publish(conversions.motion_stamped(T_new_old, stamp_ns, self._config.map_frame))
 
     def publish(self, result: TrackingResult, image_frame: str) -> None:
         """Publish the pose of a frame that was tracked."""

@@ -50,6 +50,20 @@ class StampBuffer(Generic[Item]):
                 self._changed.wait(left)
             return self._items[stamp_ns]
 
+    def nearest(self, stamp_ns: int, max_apart_ns: int, timeout_s: float) -> Item | None:
+        """Return the item nearest to a stamp; wait for one that is not older, while none is."""
+        deadline = time.monotonic() + timeout_s
+        with self._changed:
+            while not any(stamp >= stamp_ns for stamp in self._items):
+                left = deadline - time.monotonic()
+                if left <= 0:
+                    break
+                self._changed.wait(left)
+            found = min(self._items, key=lambda stamp: abs(stamp - stamp_ns), default=None)
+            if found is None or abs(found - stamp_ns) > max_apart_ns:
+                return None
+            return self._items[found]
+
     def newest(self, not_after_ns: int, max_age_ns: int) -> Item | None:
         """Return the newest item up to a stamp and not older than an age before it."""
         with self._changed:

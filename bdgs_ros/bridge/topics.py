@@ -19,6 +19,8 @@ KEYFRAMES = 'bdgs/keyframes'
 STATUS = 'bdgs/status'
 """One message per image that tracking took: the acknowledgement that lockstep waits for."""
 KEYFRAME = 'bdgs/keyframe'
+MOVE = 'bdgs/move'
+"""By what tracking moved the present before a frame: it learnt where its keyframes are."""
 MODEL_IMAGE = 'bdgs/model/image'
 MODEL_DEPTH = 'bdgs/model/depth'
 MODEL_DYNAMIC = 'bdgs/model/dynamic'

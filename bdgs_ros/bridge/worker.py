@@ -7,7 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from functools import partial
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from bdgs_ros.bridge.priority import give_way
 
@@ -32,6 +32,8 @@ class Worker(Generic[Item]):
         See `idle`.
     nice : int
         How much the thread gives way to others, see `priority.give_way`.
+    source : Worker, optional
+        One that hands its items over to this one: what is not handed over yet waits here too.
 
     """
 
@@ -43,6 +45,7 @@ class Worker(Generic[Item]):
         idle: Callable[[], None] = lambda: None,
         idle_period_s: float = 0.1,
         nice: int = 0,
+        source: Worker[Any] | None = None,
     ) -> None:
         self.dropped = 0
         self._handle = handle
@@ -51,6 +54,7 @@ class Worker(Generic[Item]):
         self._idle = idle
         self._idle_period_s = idle_period_s
         self._nice = nice
+        self._source = source
         self._items: deque[Item] = deque()
         self._first: Callable[[], None] | None = None
         self._changed = threading.Condition()
@@ -90,6 +94,8 @@ class Worker(Generic[Item]):
     def wait_idle(self, timeout_s: float) -> bool:
         """Return whether everything was handled within a time."""
         deadline = time.monotonic() + timeout_s
+        if self._source is not None and not self._source.wait_idle(timeout_s):
+            return False
         with self._changed:
             while self._items or self._busy or self._first is not None:
                 left = deadline - time.monotonic()

@@ -1,8 +1,10 @@
 """
 What became of the keyframes: how late corrections reach the frames between them.
 
-Frames are tracked against the view of a keyframe. When the map later moves that keyframe, they
-move with it; between two keyframes the corrections of both are blended.
+Frames are tracked relative to a keyframe, from where tracking believes that to be. When the map
+later moves the keyframe, they move with it; between two keyframes the corrections of both are
+blended. Tracking itself moves when mapping answers, in real time amid the frames of a keyframe:
+those before that are corrected by all of it, those after by what came later.
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -21,7 +24,7 @@ from bdgs_ros.mapping.keyframes import MapKeyframe
 
 Array = NDArray[np.float32]
 
-_POSES = ('online', 'tracked', 'final')
+_POSES = ('online', 'final')
 
 
 @dataclass
@@ -30,8 +33,6 @@ class Anchor:
 
     online: Pose
     """As tracking gave it."""
-    tracked: Pose
-    """When its view was given to tracking."""
     final: Pose
     exposure: Array
 
@@ -42,6 +43,8 @@ class History:
     def __init__(self) -> None:
         self._anchors: dict[int, Anchor] = {}
         self._earlier_ns: list[int] = []
+        # By what tracking moved all that it knew, T_new_old, and the first frame after that.
+        self._moves: list[tuple[int, Pose]] = []
 
     @property
     def stamps_ns(self) -> list[int]:
@@ -51,17 +54,19 @@ class History:
     def begin_run(self) -> None:
         """Keep of earlier runs nothing but the stamps: their poses correct no new frame."""
         self._earlier_ns, self._anchors = self.stamps_ns, {}
+        self._moves = []
 
     @property
     def poses(self) -> dict[int, Pose]:
         """`T_world_camera` of this run's keyframes by stamp (ns), as they are now."""
         return {stamp_ns: anchor.final for stamp_ns, anchor in self._anchors.items()}
 
-    def add(self, keyframe: MapKeyframe, tracked: Pose | None = None) -> None:
-        """Take a keyframe, and where tracking saw it if it has been moved since."""
-        pose = keyframe.T_world_camera
-        online = pose if tracked is None else tracked
-        self._anchors[keyframe.stamp_ns] = Anchor(online, pose, pose, keyframe.exposure.copy())
+    def add(self, stamp_ns: int, online: Pose, final: Pose | None = None) -> None:
+        """Take a keyframe, newer than all others: where tracking saw it, where it is now."""
+        exposure = np.zeros(2, np.float32)
+        if self._anchors:
+            exposure = self._anchors[max(self._anchors)].exposure.copy()
+        self._anchors[stamp_ns] = Anchor(online, online if final is None else final, exposure)
 
     def move(self, transforms: Mapping[int, Pose]) -> None:
         """Move keyframes by `T_new_old` in world, by stamp (ns)."""
@@ -70,9 +75,9 @@ class History:
             if anchor is not None:
                 anchor.final = se3.orthonormalise(T_new_old @ anchor.final)
 
-    def publish(self, keyframe: MapKeyframe) -> None:
-        """Note that tracking now gets the view of a keyframe from where it is."""
-        self._anchors[keyframe.stamp_ns].tracked = keyframe.T_world_camera
+    def note_move(self, stamp_ns: int, T_new_old: Pose) -> None:
+        """Note that tracking moved everything before a frame: it learnt where keyframes are."""
+        self._moves.append((stamp_ns, T_new_old))
 
     def refresh(self, keyframes: Iterable[MapKeyframe]) -> None:
         """Take over the present poses and exposures."""
@@ -120,13 +125,28 @@ class History:
         own = self._anchors[before]
         if stamp_ns <= before:
             return own.final @ se3.inverse(own.online)
-        held = own.final @ se3.inverse(own.tracked)
+        held = self._held(before, stamp_ns)
         if after == before:
             return held
         next_one = self._anchors[after]
         coming = next_one.final @ se3.inverse(next_one.online)
-        step = se3.log(coming @ se3.inverse(held))
+        step = se3.log(coming @ se3.inverse(self._held(before, after)))
         return se3.orthonormalise(se3.exp(share * step) @ held)
+
+    def _held(self, keyframe_ns: int, stamp_ns: int) -> Pose:
+        """Return T_final_online at a time that holds the motion since a keyframe."""
+        own = self._anchors[keyframe_ns]
+        believed = self._moved_between(keyframe_ns, stamp_ns) @ own.online
+        return own.final @ se3.inverse(believed)
+
+    def _moved_between(self, keyframe_ns: int, stamp_ns: int) -> Pose:
+        """Return by what tracking moved a keyframe before it tracked a later frame."""
+        first = bisect_right(self._moves, keyframe_ns, key=itemgetter(0))
+        last = bisect_right(self._moves, stamp_ns, key=itemgetter(0))
+        moved = se3.identity()
+        for _, T_new_old in self._moves[first:last]:
+            moved = T_new_old @ moved
+        return moved
 
     def _around(self, stamp_ns: int) -> tuple[int, int, float]:
         """Return the keyframes before and after a time, and how far between them it lies."""
@@ -147,7 +167,11 @@ class History:
             }
             for stamp_ns, anchor in self._anchors.items()
         ]
-        return {'anchors': anchors, 'earlier_ns': self._earlier_ns}
+        moves = [
+            {'stamp_ns': stamp_ns, 'T_new_old': T_new_old.tolist()}
+            for stamp_ns, T_new_old in self._moves
+        ]
+        return {'anchors': anchors, 'moves': moves, 'earlier_ns': self._earlier_ns}
 
     @classmethod
     def from_document(cls, document: dict[str, Any]) -> History:
@@ -155,7 +179,10 @@ class History:
         history = cls()
         history._earlier_ns = [int(stamp) for stamp in document['earlier_ns']]
         for entry in document['anchors']:
-            online, tracked, final = (np.array(entry[n], float).reshape(4, 4) for n in _POSES)
+            online, final = (np.array(entry[n], float).reshape(4, 4) for n in _POSES)
             exposure = np.array(entry['exposure'], np.float32).reshape(2)
-            history._anchors[int(entry['stamp_ns'])] = Anchor(online, tracked, final, exposure)
+            history._anchors[int(entry['stamp_ns'])] = Anchor(online, final, exposure)
+        for entry in document['moves']:
+            T_new_old = np.array(entry['T_new_old'], float).reshape(4, 4)
+            history.note_move(int(entry['stamp_ns']), T_new_old)
         return history

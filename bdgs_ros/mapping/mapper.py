@@ -101,9 +101,16 @@ class Mapper:
         self._index_of: dict[int, int] = {}  # of this run's keyframes, by stamp
         self._rng = np.random.default_rng(self._config.seed)
 
-    def process(
-        self, keyframe: Keyframe, tracked: Pose | None = None, early: Answer | None = None
-    ) -> ModelView | None:
+    @property
+    def grows(self) -> bool:
+        """Whether keyframes change the map."""
+        return self._config.enabled and not self.frozen
+
+    def announce(self, stamp_ns: int, T_world_camera: Pose) -> None:
+        """Take the pose of a new keyframe, as tracking gave it; it moves with `correct_poses`."""
+        self.history.add(stamp_ns, T_world_camera)
+
+    def process(self, keyframe: Keyframe, early: Answer | None = None) -> ModelView | None:
         """
         Take a keyframe into the map.
 
@@ -111,8 +118,6 @@ class Mapper:
         ----------
         keyframe : Keyframe
             Frame, pose and dynamic prior.
-        tracked : ndarray, shape (4, 4), optional
-            Pose that tracking gave it, where the back end has corrected it since.
         early : callable, optional
             Called with the view as it is before optimisation, which takes most of the time. If
             the next keyframe waits after that, it has to do.
@@ -134,7 +139,7 @@ class Mapper:
         static = self._look(small, agree)
         in_front = self._in_front(small, static)
         level = self._growth_level(small, in_front)
-        current = self._remember(fine, level.static, tracked)
+        current = self._remember(fine, level.static)
         self._calibrate(current, level, static)
         self._insert(current, level, static, in_front & ~is_dynamic(small.p_dynamic))
         companions = self._companions()
@@ -149,8 +154,7 @@ class Mapper:
         return self._answer(current)
 
     def _answer(self, current: MapKeyframe) -> ModelView:
-        """Render what tracking gets, and note that it does."""
-        self.history.publish(current)
+        """Render what tracking gets."""
         pose, camera = current.T_world_camera, current.levels[0].camera
         return self.view(current.stamp_ns, pose, camera, current.exposure)
 
@@ -248,7 +252,7 @@ class Mapper:
     def _levels(self, frame: RgbdFrame, moving: Mask, count: int) -> tuple[Level, ...]:
         return build_levels(frame.color, frame.depth_m, moving, frame.camera, count, self.vignette)
 
-    def _remember(self, keyframe: Keyframe, static: Mask, tracked: Pose | None) -> MapKeyframe:
+    def _remember(self, keyframe: Keyframe, static: Mask) -> MapKeyframe:
         """Keep the keyframe's images; `static` may be of a smaller size."""
         frame = keyframe.frame
         size = (frame.camera.width, frame.camera.height)
@@ -262,7 +266,8 @@ class Mapper:
         if self.keyframes:
             current.exposure = self.keyframes[-1].exposure.copy()
         self.keyframes.append(current)
-        self.history.add(current, tracked)
+        if current.stamp_ns not in self.history.poses:
+            self.history.add(current.stamp_ns, current.T_world_camera)
         self._index_of[current.stamp_ns] = current.index
         if len(self.keyframes) > max(self._config.keyframes, self._config.window):
             redundant = most_redundant(self.keyframes[: -self._config.window])
@@ -330,13 +335,13 @@ class Mapper:
             what is not named, or unknown, stays.
 
         """
-        known = {s: T for s, T in transforms.items() if s in self._index_of}
-        self.map.deform({self._index_of[s]: T for s, T in known.items()})
+        brought = {self._index_of[s]: T for s, T in transforms.items() if s in self._index_of}
+        self.map.deform(brought)
         self.history.refresh(self.keyframes)
-        self.history.move(known)
+        self.history.move(transforms)
         for keyframe in self.keyframes:
-            if keyframe.stamp_ns in known:
-                T_new_old = known[keyframe.stamp_ns]
+            if keyframe.index in brought:
+                T_new_old = brought[keyframe.index]
                 keyframe.T_world_camera = se3.orthonormalise(T_new_old @ keyframe.T_world_camera)
 
     def keyframe_poses(self) -> dict[int, Pose]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -17,6 +17,7 @@ from std_msgs.msg import Empty
 
 from bdgs_ros.back_end.back_end import BackEnd
 from bdgs_ros.bridge import conversions, parameters, topics
+from bdgs_ros.bridge.adjuster import Adjuster
 from bdgs_ros.bridge.cdr_image import CdrImage, image_from_cdr
 from bdgs_ros.bridge.frames import FrameDecoder, FrameSource, RawFrame
 from bdgs_ros.bridge.health import Health
@@ -29,7 +30,7 @@ from bdgs_ros.bridge.worker import Worker
 from bdgs_ros.core.errors import BdgsError
 from bdgs_ros.core.types import (
     Keyframe,
-    ModelView,
+    Pose,
     ProbabilityImage,
     RgbdFrame,
     StampedPose,
@@ -37,7 +38,7 @@ from bdgs_ros.core.types import (
 from bdgs_ros.mapping.mapper import Mapper
 from bdgs_ros.nodes.map_entrance import MapEntrance
 from bdgs_ros.nodes.map_services import AT_RUN_TIME, LiveMap, MapServices
-from bdgs_ros.pipeline import take_keyframe
+from bdgs_ros.pipeline import Adjustment
 
 _FRAME_WAIT_S = 2.0
 _PENDING_S = 30.0
@@ -59,7 +60,13 @@ class MappingNode(GraphNode):
         self._health = Health(self, 'mapping')
         self._mapper = Mapper(config.mapping, config.belief, self._is_hurried)
         self._live = LiveMap(self._mapper)
-        self._back_end = BackEnd(config.back_end)
+        self._back_end = Adjuster(
+            BackEnd(config.back_end),
+            self._mapper,
+            self._publish_keyframes,
+            lambda view: self._models.publish(view.stamp_ns, view),
+            at_once=not config.lockstep,
+        )
         self._tracked: deque[StampedPose] = deque(maxlen=_POSES_KEPT)
         self._lock = self._live.lock  # of the mapper: worker and services
         self._frames: StampBuffer[RawFrame] = StampBuffer(config.frame_buffer)
@@ -70,12 +77,16 @@ class MappingNode(GraphNode):
         self._map_services = MapServices(
             self, config, self._health, self._live, self._settle, self._on_loaded
         )
+        self._adjusting: Worker[Callable[[], None]] = Worker(
+            lambda task: task(), self._health.error, None, nice=config.back_end_nice
+        )
         self._worker: Worker[Callable[[], None]] = Worker(
             lambda task: task(),
             self._health.error,
             None if config.lockstep else config.keyframe_queue,
             self._on_idle,
             nice=config.mapping_nice,
+            source=self._adjusting,
         )
         self._entrance = MapEntrance(
             self, self._live, self._decoder, self._models, self._output, self._health,
@@ -94,6 +105,7 @@ class MappingNode(GraphNode):
             PoseStamped, topics.KEYFRAME, self._queue_keyframe, topics.RELIABLE
         )
         self.create_subscription(PoseStamped, topics.POSE, self._keep_pose, topics.RELIABLE)
+        self.create_subscription(PoseStamped, topics.MOVE, self._note_move, topics.RELIABLE)
         self.create_subscription(
             Empty, topics.RESET_EVENT, lambda _: self._forget(), topics.RELIABLE
         )
@@ -117,6 +129,11 @@ class MappingNode(GraphNode):
         if self._mapper.frozen:
             self._worker.wake()
 
+    def _note_move(self, message: PoseStamped) -> None:
+        if self._live.is_entered:
+            T_new_old = conversions.motion_from_message(message)
+            self._mapper.history.note_move(conversions.stamp_ns(message), T_new_old)
+
     def _queue_keyframe(self, message: PoseStamped) -> None:
         stamp_ns = conversions.stamp_ns(message)
         if not self._live.is_entered:
@@ -125,48 +142,72 @@ class MappingNode(GraphNode):
             return
         # Its images are taken along now: they may be forgotten when its turn comes.
         raw = self._frames.get(stamp_ns)
-        self._worker.put(partial(self._on_keyframe, message, raw))
+        self._adjusting.put(partial(self._on_keyframe, message, raw))
 
     def _on_keyframe(self, message: PoseStamped, raw: RawFrame | None) -> None:
+        """Have the back end look at a keyframe, then hand it over to the map."""
         stamp_ns = conversions.stamp_ns(message)
-        view = None
         try:
             keyframe = self._assemble(message, raw or self._wait_frame(stamp_ns))
-            if keyframe is not None:
-                view = self._map(keyframe)
+        except BdgsError as error:
+            keyframe = None
+            self._health.error(error)
+        if keyframe is None:
+            self._answer_nothing(stamp_ns)
+        elif not self._mapper.grows:
+            self._worker.put(partial(self._show_map, keyframe))
+        else:
+            with self._health.timed('back_end'):
+                adjustment = self._back_end.adjust(keyframe, self._tracked_until(stamp_ns))
+            if adjustment is not None:
+                self._worker.put(partial(self._map, keyframe, adjustment))
+            self._health.counts['keyframes_dropped'] = self._worker.dropped
+
+    def _answer_nothing(self, stamp_ns: int) -> None:
+        """Tell tracking, which waits in lockstep, not to."""
+        if self._config.lockstep:
+            self._models.publish(stamp_ns, None)
+
+    def _map(self, keyframe: Keyframe, adjustment: Adjustment) -> None:
+        answered = False
+        try:
+            with self._health.timed('mapping'), self._lock:
+                answered = self._back_end.into_map(keyframe, adjustment)
+                self._live.version += 1
         except BdgsError as error:
             self._health.error(error)
-        finally:  # an empty answer tells tracking, which waits in lockstep, not to
-            if view is not None or self._config.lockstep:
-                self._models.publish(stamp_ns, view)
-        self._publish_keyframes(stamp_ns)
-        self._health.counts['gaussians'] = len(self._mapper.map)
-        self._health.counts['keyframes_dropped'] = self._worker.dropped
+        if not answered:
+            self._answer_nothing(adjustment.stamp_ns)
+        self._count_keyframe()
 
-    def _map(self, keyframe: Keyframe) -> ModelView | None:
+    def _show_map(self, keyframe: Keyframe) -> None:
+        """Answer a keyframe with a view of a map that does not change."""
         with self._health.timed('mapping'), self._lock:
-            stamp_ns = keyframe.frame.stamp_ns
-            self._observe_until(stamp_ns)
-            early = None if self._config.lockstep else partial(self._models.publish, stamp_ns)
-            view = take_keyframe(self._back_end, self._mapper, keyframe, early)
-            self._live.version += not self._mapper.frozen
+            view = self._mapper.process(keyframe)
+        self._models.publish(keyframe.frame.stamp_ns, view)
+        self._count_keyframe()
+
+    def _count_keyframe(self) -> None:
         self._health.counts['keyframes'] += 1
-        return view
+        self._health.counts['gaussians'] = len(self._mapper.map)
 
-    def _publish_keyframes(self, stamp_ns: int) -> None:
+    def _publish_keyframes(self, poses: Mapping[int, Pose]) -> None:
         """Say where the keyframes are now: a closed loop moves those of long ago."""
-        poses = [StampedPose(*item) for item in sorted(self._mapper.keyframe_poses().items())]
-        frame = self._config.map_frame
-        self._keyframes.publish(conversions.path_message(poses, stamp_ns, frame))
+        stamped = [StampedPose(*item) for item in sorted(poses.items())]
+        newest_ns = max(poses, default=0)
+        path = conversions.path_message(stamped, newest_ns, self._config.map_frame)
+        self._keyframes.publish(path)
 
-    def _observe_until(self, stamp_ns: int) -> None:
-        """Give the back end the poses of frames up to a keyframe; it knows that one itself."""
+    def _tracked_until(self, stamp_ns: int) -> list[StampedPose]:
+        """Take the poses of frames up to a keyframe; the back end knows that one itself."""
+        found = []
         while self._tracked and self._tracked[0].stamp_ns < stamp_ns:
-            tracked = self._tracked.popleft()
-            self._back_end.observe(tracked.stamp_ns, tracked.T_world_camera)
+            found.append(self._tracked.popleft())
+        return found
 
     def _is_hurried(self) -> bool:
-        return not self._config.lockstep and self._worker.waiting > 0
+        waiting = self._adjusting.waiting + self._worker.waiting
+        return not self._config.lockstep and waiting > 0
 
     def _wait_frame(self, stamp_ns: int) -> RawFrame | None:
         timeout_s = self._config.lockstep_timeout_s if self._config.lockstep else _FRAME_WAIT_S
@@ -183,18 +224,24 @@ class MappingNode(GraphNode):
         return Keyframe(frame, conversions.pose_from_message(message.pose), labels)
 
     def _labels_of(self, frame: RgbdFrame) -> ProbabilityImage:
-        """Return the labels of a frame; in real time the nearest older ones will do."""
+        """Return the labels of a frame; in real time the nearest ones will do."""
         if self._mapper.frozen:  # they would change nothing
             return np.zeros(frame.camera.shape, np.uint8)
-        present = self.count_publishers(topics.LABELS) > 0
-        limit_s = self._config.lockstep_timeout_s if self._config.lockstep else _LABELS_WAIT_S
-        message = self._labels.wait(frame.stamp_ns, limit_s if present else 0.0)
-        if message is None:
-            message = self._labels.newest(frame.stamp_ns, _MAX_LABEL_AGE_NS)
+        message = self._find_labels(frame.stamp_ns)
         if message is None:
             self._health.counts['keyframes_without_labels'] += 1
             return np.zeros(frame.camera.shape, np.uint8)
         return conversions.probability_from_message(message, topics.LABELS)
+
+    def _find_labels(self, stamp_ns: int) -> CdrImage | None:
+        """Find labels: detection passes images over in real time, so newer ones end the wait."""
+        present = self.count_publishers(topics.LABELS) > 0
+        if self._config.lockstep and present:
+            found = self._labels.wait(stamp_ns, self._config.lockstep_timeout_s)
+            if found is not None:
+                return found
+        wait_s = _LABELS_WAIT_S if present and not self._config.lockstep else 0.0
+        return self._labels.nearest(stamp_ns, _MAX_LABEL_AGE_NS, wait_s)
 
     def _on_idle(self) -> None:
         """Between keyframes: show the map, and save it if that is due."""
@@ -209,6 +256,9 @@ class MappingNode(GraphNode):
         self._frames.clear()
         self._live.poses, self._live.is_entered = [], True
         self._entrance.forget()
+        self._tracked.clear()
+        self._back_end.forget()
+        self._adjusting.restart(self._back_end.reset)
         self._worker.restart(self._start_over)
 
     def _start_over(self) -> None:
@@ -217,8 +267,6 @@ class MappingNode(GraphNode):
                 self._mapper.reset()
                 self._live.version += 1
                 self._map_services.withdraw()
-            self._back_end.reset()
-            self._tracked.clear()
         self._output.forget()
 
     def _settle(self) -> None:
@@ -226,15 +274,17 @@ class MappingNode(GraphNode):
 
     def _on_loaded(self) -> None:
         """Give up what belongs to the world before; the mapper is locked and has another map."""
+        self._adjusting.restart(lambda: None)
         self._worker.restart(lambda: None)
         self._tracked.clear()
         self._back_end.start_from(self._mapper.readout_s)
         self._output.forget()
-        self._publish_keyframes(0)
+        self._publish_keyframes({})
 
     def close(self) -> None:
         """Stop working."""
         self._map_services.stop()
+        self._adjusting.stop()
         self._worker.stop()
 
 

@@ -113,6 +113,9 @@ class TrackingNode(GraphNode):
         for view in self._feedback.new_models():
             self._tracker.set_model(view)
         self._tracker.note_keyframes(self._feedback.moved_keyframes())
+        move = self._tracker.take_move()
+        if move is not None:
+            self._output.publish_move(raw.stamp_ns, move)
         started = time.perf_counter()
         result = self._tracker.process(frame, labels)
         tracking_ms = (time.perf_counter() - started) * 1e3

@@ -77,6 +77,7 @@ class CameraTracker:
         self._keyframe: Reference | None = None
         self._model: Reference | None = None
         self._tracked: dict[int, Pose] = {}  # keyframes whose view has not come yet
+        self._move: Pose | None = None  # of all that is known, since the last frame
         self._is_lost = False
         self._hypothesis: Hypothesis | None = None
         self.evidence: Evidence | None = None
@@ -135,26 +136,46 @@ class CameraTracker:
 
     def note_keyframes(self, poses: Mapping[int, Pose]) -> None:
         """
-        Take where mapping has the keyframes now: places are where they were seen.
+        Take where mapping has the keyframes now; what was seen from them moves along.
 
         Parameters
         ----------
         poses : mapping of int to ndarray, shape (4, 4)
-            `T_world_camera` by stamp (ns). Keyframes whose view is still to come move with that.
+            `T_world_camera` by stamp (ns). Newer keyframes move with the newest of them.
 
         """
-        settled = {stamp_ns: T for stamp_ns, T in poses.items() if stamp_ns not in self._tracked}
-        self._places.put(settled)
-        self._move_present(settled)
+        if not poses:
+            return
+        waiting = [stamp_ns for stamp_ns in poses if stamp_ns in self._tracked]
+        if waiting:
+            newest = max(waiting)
+            T_new_old = poses[newest] @ se3.inverse(self._tracked[newest])
+            for stamp_ns, pose in self._tracked.items():
+                moved = se3.orthonormalise(T_new_old @ pose) if stamp_ns > newest else pose
+                self._tracked[stamp_ns] = poses.get(stamp_ns, moved)
+        known = {**poses, **self._tracked}
+        if self._model is not None and self._model.stamp_ns in known:
+            self._model = replace(self._model, T_world_camera=known[self._model.stamp_ns])
+        self._places.put(known)
+        self._move_present(known)
 
     def _move_present(self, poses: Mapping[int, Pose]) -> None:
         """Move the present with the keyframe that it is relative to."""
         if self._keyframe is None or self._keyframe.stamp_ns not in poses:
             return
-        self._hypothesis = None
         new = poses[self._keyframe.stamp_ns]
-        self._motion.move(se3.orthonormalise(new @ se3.inverse(self._keyframe.T_world_camera)))
+        if np.array_equal(new, self._keyframe.T_world_camera):
+            return
+        self._hypothesis = None
+        T_new_old = se3.orthonormalise(new @ se3.inverse(self._keyframe.T_world_camera))
+        self._motion.move(T_new_old)
+        self._move = T_new_old if self._move is None else T_new_old @ self._move
         self._keyframe = replace(self._keyframe, T_world_camera=new)
+
+    def take_move(self) -> Pose | None:
+        """Return by what the present has been moved since the last call, T_new_old in world."""
+        move, self._move = self._move, None
+        return move
 
     def process(self, frame: RgbdFrame, labels: Labels | None = None) -> TrackingResult:
         """

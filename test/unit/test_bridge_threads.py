@@ -204,3 +204,36 @@ def test_a_worker_that_is_woken_calls_idle_at_once() -> None:
     worker.wake()
     assert idle.wait(2.0)
     worker.stop()
+
+
+def test_waiting_for_idle_includes_what_another_worker_is_to_hand_over() -> None:
+    gate = threading.Event()
+    done: list[int] = []
+    last: Worker[int]
+
+    def hand_over(item: int) -> None:
+        gate.wait(2.0)
+        last.put(item)
+
+    first: Worker[int] = Worker(hand_over, lambda error: None, capacity=None)
+    last = Worker(done.append, lambda error: None, capacity=None, source=first)
+    first.put(7)
+    assert not last.wait_idle(0.05)
+    gate.set()
+    assert last.wait_idle(2.0)
+    assert done == [7]
+    first.stop()
+    last.stop()
+
+
+def test_the_nearest_item_is_known_once_a_newer_one_is_there() -> None:
+    buffer: StampBuffer[str] = StampBuffer(5)
+    assert buffer.nearest(100, 50, timeout_s=0.01) is None
+    buffer.put(60, 'before')
+    assert buffer.nearest(100, 50, timeout_s=0.01) == 'before'
+    threading.Timer(0.05, buffer.put, (110, 'after')).start()
+    started = time.monotonic()
+    assert buffer.nearest(100, 50, timeout_s=5.0) == 'after'
+    assert time.monotonic() - started < 2.0
+    assert buffer.nearest(80, 50, timeout_s=0.0) == 'before'
+    assert buffer.nearest(300, 50, timeout_s=0.0) is None

@@ -44,12 +44,11 @@ def two(held: float = 0.0) -> tuple[History, list[MapKeyframe]]:
     """Keyframes at 0 and 100 ns; the first had been moved by `held` when its view was given."""
     history = History()
     first = keyframe(0, 0, np.eye(4))
-    history.add(first)
+    history.add(0, first.T_world_camera)
     first.T_world_camera = shifted(held)
-    history.publish(first)
+    history.note_move(1, shifted(held))
     second = keyframe(1, 100, online(100).poses[0].T_world_camera)
-    history.add(second)
-    history.publish(second)
+    history.add(100, second.T_world_camera)
     return history, [first, second]
 
 
@@ -74,6 +73,15 @@ def test_what_tracking_already_knew_is_not_added_twice() -> None:
     at_keyframe, later = moved(history, 0, 50)
     assert at_keyframe == pytest.approx(0.3)
     assert later == pytest.approx(0.0, abs=1e-9)
+
+
+def test_frames_before_a_late_answer_are_corrected_by_all_of_it() -> None:
+    """Tracking learnt at 60 ns that the keyframe at 0 is 0.3 further; mapping knows it now."""
+    history, keyframes = two()
+    keyframes[0].T_world_camera = shifted(0.3)
+    history.note_move(60, shifted(0.3))
+    history.refresh(keyframes)
+    assert moved(history, 0, 59, 60, 99) == pytest.approx([0.3, 0.3, 0, 0], abs=1e-9)
 
 
 def test_frames_before_the_first_keyframe_move_with_it() -> None:
@@ -131,5 +139,5 @@ def test_a_new_run_is_not_corrected_by_the_keyframes_of_an_earlier_one() -> None
     assert history.stamps_ns == [0, 100]
     history.refresh(keyframes)
     assert moved(history, 0, 100) == [0, 0]
-    history.add(keyframe(2, 500, np.eye(4)))
+    history.add(500, np.eye(4))
     assert history.stamps_ns == [0, 100, 500]
