@@ -84,7 +84,7 @@ class DetectionNodeConfig(GraphConfig):
     """Parameters of detection_node."""
 
     labels_rate: float = param(
-        15.0, 'images labelled at most, others are passed over (realtime)', unit='Hz', low=0.1
+        10.0, 'images labelled at most, others are passed over (realtime)', unit='Hz', low=0.1
     )
     detection_nice: int = param(5, 'how much detection gives way to tracking', low=0, high=19)
     detection: DetectionConfig = field(default_factory=DetectionConfig)

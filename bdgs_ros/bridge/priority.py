@@ -1,4 +1,4 @@
-"""Which thread goes first where there are more of them than cores; ROS-free."""
+"""Which thread goes first where there are more of them than processors; ROS-free."""
 
 from __future__ import annotations
 
@@ -18,3 +18,10 @@ def give_way(nice: int) -> None:
     if nice and sys.platform.startswith('linux'):
         with contextlib.suppress(OSError):  # a wish, not a need
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), nice)
+
+
+def leave_one(threads: int) -> int:
+    """Return how many of the threads run at once if one processor is left to others."""
+    affinity = getattr(os, 'sched_getaffinity', None)  # what this process may use; Linux
+    processors = len(affinity(0)) if affinity else os.cpu_count() or 1
+    return max(1, min(threads, processors - 1))

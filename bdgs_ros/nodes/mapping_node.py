@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections import deque
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -24,9 +25,11 @@ from bdgs_ros.bridge.health import Health
 from bdgs_ros.bridge.map_output import MapOutput
 from bdgs_ros.bridge.model_view import ModelPublisher
 from bdgs_ros.bridge.node_config import MappingNodeConfig
+from bdgs_ros.bridge.priority import leave_one
 from bdgs_ros.bridge.runner import GraphNode, run
 from bdgs_ros.bridge.stamped import StampBuffer
 from bdgs_ros.bridge.worker import Worker
+from bdgs_ros.core.config import MappingConfig
 from bdgs_ros.core.errors import BdgsError
 from bdgs_ros.core.types import (
     Keyframe,
@@ -58,7 +61,7 @@ class MappingNode(GraphNode):
         self.nice = config.mapping_nice
         self._config = config
         self._health = Health(self, 'mapping')
-        self._mapper = Mapper(config.mapping, config.belief, self._is_hurried)
+        self._mapper = Mapper(_mapping_config(config), config.belief, self._is_hurried)
         self._live = LiveMap(self._mapper)
         self._back_end = Adjuster(
             BackEnd(config.back_end),
@@ -286,6 +289,12 @@ class MappingNode(GraphNode):
         self._map_services.stop()
         self._adjusting.stop()
         self._worker.stop()
+
+
+def _mapping_config(config: MappingNodeConfig) -> MappingConfig:
+    """Return the mapper's parameters; in real time tracking must not wait for its threads."""
+    threads = config.mapping.threads
+    return replace(config.mapping, threads=threads if config.lockstep else leave_one(threads))
 
 
 def main(args: list[str] | None = None) -> int:

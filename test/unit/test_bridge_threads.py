@@ -14,6 +14,7 @@ import pytest
 
 from bdgs_ros.bridge.acknowledgements import Acknowledgements
 from bdgs_ros.bridge.pace import Pace
+from bdgs_ros.bridge.priority import leave_one
 from bdgs_ros.bridge.stamped import Assembler, StampBuffer
 from bdgs_ros.bridge.worker import Worker
 
@@ -237,3 +238,11 @@ def test_the_nearest_item_is_known_once_a_newer_one_is_there() -> None:
     assert time.monotonic() - started < 2.0
     assert buffer.nearest(80, 50, timeout_s=0.0) == 'before'
     assert buffer.nearest(300, 50, timeout_s=0.0) is None
+
+
+@pytest.mark.parametrize(('processors', 'threads'), [(1, 1), (2, 1), (3, 2), (16, 2)])
+def test_one_processor_is_left(
+    processors: int, threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, 'sched_getaffinity', lambda _: set(range(processors)), raising=False)
+    assert leave_one(2) == threads

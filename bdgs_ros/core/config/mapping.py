@@ -172,7 +172,9 @@ class MappingConfig:
     keyframes: int = param(
         64, 'keyframes whose images are kept; of others only the Gaussians', low=2, high=100000
     )
-    threads: int = param(2, 'threads of the rasteriser', low=1, high=64)
+    threads: int = param(
+        2, 'of the rasteriser; in real time one processor is left to tracking', low=1, high=64
+    )
     backend: str = param(
         'auto', 'rasteriser; gsplat needs CUDA', choices=('auto', 'gsplat', 'native', 'torch')
     )
