@@ -35,6 +35,10 @@ class CpuTimed:
         """Be the mapper in everything else."""
         return getattr(self._mapper, name)
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Hand on what the back end tells the mapper."""
+        object.__setattr__(self if name in ('_mapper', 'cpu_ms') else self._mapper, name, value)
+
 
 @dataclass
 class BlockWatch:

@@ -93,6 +93,12 @@ def rows_of(times):
     ]  # fmt: skip
 
 
+def test_the_timed_mapper_learns_what_the_back_end_says():
+    mapper = SimpleNamespace(readout_s=0.0)
+    long_run.CpuTimed(mapper).readout_s = 0.027
+    assert mapper.readout_s == 0.027
+
+
 def test_growth_is_over_the_second_block():
     times = [100.0, None, 200.0, None, 210.0, 190.0, 220.0, None, 240.0]
     mapper = long_run.CpuTimed(SimpleNamespace(map=[0] * 7, process=lambda keyframe: keyframe))
