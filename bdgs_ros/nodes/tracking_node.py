@@ -117,7 +117,7 @@ class TrackingNode(GraphNode):
         if move is not None:
             self._output.publish_move(raw.stamp_ns, move)
         started = time.perf_counter()
-        result = self._tracker.process(frame, labels)
+        result = self._tracker.process(frame, labels, self._is_hurried())
         tracking_ms = (time.perf_counter() - started) * 1e3
         if result.status is TrackingStatus.OK:
             self._feedback.note_keyframe(result, frame.camera)
@@ -126,6 +126,9 @@ class TrackingNode(GraphNode):
         if result.is_keyframe and self._config.lockstep:
             self._tracker.set_model(self._feedback.wait_model(result.stamp_ns))
         self._report(raw, result, tracking_ms, latency_ms)
+
+    def _is_hurried(self) -> bool:
+        return not self._config.lockstep and self._worker.waiting > 0
 
     def _report(
         self, raw: RawFrame, result: TrackingResult, tracking_ms: float, latency_ms: float

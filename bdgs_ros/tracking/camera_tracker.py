@@ -80,6 +80,7 @@ class CameraTracker:
         self._move: Pose | None = None  # of all that is known, since the last frame
         self._is_lost = False
         self._hypothesis: Hypothesis | None = None
+        self._searchless = 0  # frames since places were looked at
         self.evidence: Evidence | None = None
         """Of the last frame, aligned where it was expected."""
         self._motion.reset()
@@ -177,7 +178,9 @@ class CameraTracker:
         move, self._move = self._move, None
         return move
 
-    def process(self, frame: RgbdFrame, labels: Labels | None = None) -> TrackingResult:
+    def process(
+        self, frame: RgbdFrame, labels: Labels | None = None, hurried: bool = False
+    ) -> TrackingResult:
         """
         Estimate the camera pose of the next frame.
 
@@ -187,6 +190,10 @@ class CameraTracker:
             Newer than the last one.
         labels : Labels, optional
             Dynamic prior; without it every pixel may be static.
+        hurried : bool
+            Whether newer frames wait. To look for a lost camera at places takes as long as to
+            track some frames, so it is then done in some of them (`tracking.places.patience`), at
+            the likeliest place alone.
 
         Returns
         -------
@@ -202,7 +209,7 @@ class CameraTracker:
             return self._begin(frame, current, prior)
         self._choice.count()
         first: Attempt | None = None
-        for start in self._starts(frame, prior):
+        for start in self._starts(frame, prior, hurried):
             attempt = self._attempt(start, frame.stamp_ns, current, prior)
             first = first or attempt
             if not self._loss.objection(attempt.best.quality):
@@ -248,7 +255,7 @@ class CameraTracker:
             1.0,
         )
 
-    def _starts(self, frame: RgbdFrame, prior: ProbabilityImage) -> Iterator[Start]:
+    def _starts(self, frame: RgbdFrame, prior: ProbabilityImage, hurried: bool) -> Iterator[Start]:
         """List where the camera may be, likeliest first; places cost time, so they are last."""
         if self._hypothesis is not None:
             yield self._confirming(self._hypothesis, frame.stamp_ns)
@@ -258,7 +265,12 @@ class CameraTracker:
         elif self._model is not None:
             pose = self._model.T_world_camera
             yield Start(self._model, pose, information_of(_START_SIGMA), is_far=True)
-        for sighting in self._places.find(frame, prior):
+        self._searchless += 1
+        if hurried and self._searchless <= self._config.places.patience:
+            return
+        self._searchless = 0
+        sightings = self._places.find(frame, prior)
+        for sighting in sightings[:1] if hurried else sightings:
             reference = self._recall(sighting.place)
             information = information_of(_PLACE_SIGMA)
             yield Start(reference, sighting.T_world_camera, information, is_far=True)

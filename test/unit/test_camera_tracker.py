@@ -249,6 +249,27 @@ def test_after_a_jump_back_the_camera_is_found_at_once_or_nearly(two_places: tup
     assert all(r.status is TrackingStatus.OK for r in results[2:])
 
 
+def test_a_lost_camera_seldom_looks_at_places_while_frames_wait(
+    recording: tuple, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames, _ = recording
+    tracker = CameraTracker(replace(CONFIG, places=replace(CONFIG.places, patience=2)))
+    tracker.process(frames[0])
+    searches: list[int] = []
+
+    def find(frame: RgbdFrame, p_dynamic: np.ndarray) -> list:
+        searches.append(frame.stamp_ns)
+        return []
+
+    monkeypatch.setattr(tracker._places, 'find', find)
+    dark = [replace(f, color=np.zeros_like(f.color)) for f in frames[1:10]]
+    results = [tracker.process(frame, hurried=True) for frame in dark[:6]]
+    assert all(r.status is TrackingStatus.LOST for r in results)
+    assert searches == [dark[2].stamp_ns, dark[5].stamp_ns]
+    tracker.process(dark[6])
+    assert searches[-1] == dark[6].stamp_ns
+
+
 def start_elsewhere(
     tracker: CameraTracker, frames: list[RgbdFrame], poses: list[np.ndarray]
 ) -> TrackingResult:

@@ -173,6 +173,9 @@ class PlacesConfig:
     width: int = param(320, 'of their images', unit='px', low=80, high=1280)
     features: int = param(500, 'of each', low=50, high=10000)
     candidates: int = param(3, 'likeliest places looked at in a frame', low=1, high=100)
+    patience: int = param(
+        1, 'lost frames at most that look at no place while newer frames wait', low=0, high=1000
+    )
     min_inliers: int = param(15, 'matches that agree on a pose', low=4, high=1000)
     tolerance_px: float = param(
         2.0, 'a match agrees within this, in their images', unit='px', low=0.1, high=50.0
