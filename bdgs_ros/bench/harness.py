@@ -85,6 +85,10 @@ class Options:
     """Measure also what the bench leaves out by default."""
     refine_s: float = 60.0
     """Seconds of refinement after a run; 0 for none."""
+    beside: tuple[int, ...] = (0,)
+    """How many other processes use a processor each, of live runs."""
+    rates: tuple[float, ...] = (1.0,)
+    """Of the replay, of live runs."""
     jobs: int = 1
     """Cells that run at once, where the bench allows it."""
 

@@ -7,7 +7,9 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -29,28 +31,40 @@ mapping in processes of their own and replays the recording over DDS in real tim
 its stamps; nobody waits for anybody. tracked_percent: frames with a pose over frames sent; dropped
 are those that tracking had no time for; latency: from the arrival of the later of both images to
 the pose; labels_age: how much older the labels are that a frame is tracked with; keyframes_mapped:
-of the keyframes found. ATE over the frames with a pose, online, as in bench slam.
+of the keyframes found; end_ms: from the last frame until everything is written. ATE over the
+frames with a pose, online and final, as in bench slam;
+live_beside1: beside one process, in a session of its own, that uses one processor; _rate2:
+replayed twice as fast; _no_rr: with ordinary priorities. CPU: processor seconds per second of
+replay.
 """
+_NODES = ('tracking', 'detection', 'mapping')
 TABLES = {
     'Alone': (
         *('alone_ate_cm', 'alone_ms', 'alone_p95_ms'),
         *(f'{part}_ms' for part in ('load', *PARTS, 'rest')),
     ),
     'Live': (
-        *('frames', 'tracked_percent', 'dropped', 'lost', 'ate_rmse_cm', 'ate_max_cm'),
-        *('tracking_ms', 'tracking_p95_ms', 'latency_ms', 'latency_p95_ms', 'labels_age_ms'),
-        *('labels', 'keyframes', 'keyframes_mapped', 'mapping_ms'),
+        *('frames', 'tracked_percent', 'passed_over', 'lost'),
+        *('ate_rmse_cm', 'ate_final_cm', 'ate_max_cm'),
+        *('tracking_ms', 'tracking_p95_ms', 'latency_ms', 'latency_p95_ms', 'latency_max_ms'),
+        *('round_trip_p95_ms', 'labels_age_ms', 'labels', 'shed_most'),
+    ),
+    'Live, the other nodes': (
+        *('keyframes', 'keyframes_mapped', 'back_end_ms', 'back_end_p95_ms', 'mapping_ms'),
+        *('end_ms', *(f'{node}_cpu' for node in _NODES)),
     ),
 }
 
-_SYNTH = 'walking_xyz'
+_SYNTH = ('walking_xyz', 'loop_room')
+_BUSY = 'while True: pass'
 _LIVE_TIMEOUT_S = 300.0
 _CAMERA_HZ = 30.0
 _LIVE_COLUMNS = {
     'frames': 'frames_sent',
-    'dropped': 'frames_dropped',
+    'passed_over': 'frames_dropped',
     'lost': 'frames_lost',
     'ate_rmse_cm': 'ate_rmse',
+    'ate_final_cm': 'ate_final_rmse',
     'ate_max_cm': 'ate_max',
     'tracking_ms': 'tracking_median',
     'tracking_p95_ms': 'tracking_p95',
@@ -62,7 +76,12 @@ _LIVE_COLUMNS = {
 _NODE_COLUMNS = {
     'labels_age_ms': ('tracking', 'labels_age_ms_median'),
     'labels': ('detection', 'labels'),
+    'shed_most': ('tracking', 'shed_most'),
     'keyframes_mapped': ('mapping', 'keyframes'),
+    'back_end_ms': ('mapping', 'back_end_ms_median'),
+    'back_end_p95_ms': ('mapping', 'back_end_ms_p95'),
+    'round_trip_p95_ms': ('replay', 'image_to_status_ms_p95'),
+    'latency_max_ms': ('tracking', 'image_to_pose_ms_max'),
 }
 
 
@@ -70,14 +89,38 @@ def cells(options: Options) -> list[Cell]:
     """List each recording alone and live; several seeds are repetitions of the live ones."""
     common = sequences.detector_settings('weights', options)
     real = {**sequences.real_settings(options), **common}
-    synth = {**sequences.synth_settings(_SYNTH, options), **common}
     chosen = [(sequence.name, real) for sequence in REAL]
-    chosen.append((sequences.synth_name(_SYNTH), synth))
+    for scenario in _SYNTH:
+        synth = {**sequences.synth_settings(scenario, options), **common}
+        chosen.append((sequences.synth_name(scenario), synth))
     found = []
     for name, settings in chosen:
         found.append(Cell(name, 'alone', 0, settings))
-        found += [Cell(name, 'live', seed, settings) for seed in options.seeds]
+        for how in _live_configurations(options):
+            found += [Cell(name, how, seed, settings) for seed in options.seeds]
     return found
+
+
+def _live_configurations(options: Options) -> list[str]:
+    """List `live`, with what is beside it and how fast it is, and without real-time threads."""
+    names = []
+    for beside, rate in product(options.beside, options.rates):
+        name = 'live' + (f'_beside{beside}' if beside else '')
+        names.append(name if rate == 1 else f'{name}_rate{rate:g}')
+    return [*names, *(f'{name}_no_rr' for name in names)] if options.all_cells else names
+
+
+def _live_values(configuration: str) -> tuple[int, dict[str, Any]]:
+    """Return how many processes are beside, and the parameters of a live configuration."""
+    beside, values = 0, {}
+    for word in configuration.split('_')[1:]:
+        if word.startswith('beside'):
+            beside = int(word.removeprefix('beside'))
+        elif word.startswith('rate'):
+            values['rate'] = float(word.removeprefix('rate'))
+        elif word == 'rr':
+            values['realtime_priority'] = 0
+    return beside, values
 
 
 def run_cell(cell: Cell, options: Options) -> dict[str, Any]:
@@ -131,6 +174,7 @@ def _live(recording: Path, cell: Cell, options: Options) -> dict[str, Any]:
     bag = _bag(recording, cell, options)
     output = options.work / 'runs' / cell.key
     output.mkdir(parents=True, exist_ok=True)
+    beside, own = _live_values(cell.configuration)
     values = {
         'bag': bag.resolve(),
         'output': output.resolve(),
@@ -138,9 +182,28 @@ def _live(recording: Path, cell: Cell, options: Options) -> dict[str, Any]:
         'mode': 'realtime',
         'detection.weights': sequences.weights_path(options).resolve(),
         **options.values,
+        **own,
     }
-    _run_graph(values, output / 'log.txt')
-    return live_columns(json.loads((output / 'metrics.json').read_text(encoding='utf-8')))
+    with _busy_processes(beside):
+        _run_graph(values, output / 'log.txt')
+    written = output / 'metrics.json'
+    metrics = json.loads(written.read_text(encoding='utf-8'))
+    last_sent_s = float(metrics['nodes']['replay']['last_sent_s'])
+    end_ms = 1e3 * (written.stat().st_mtime - last_sent_s)
+    return {**live_columns(metrics), 'end_ms': end_ms}
+
+
+@contextmanager
+def _busy_processes(count: int) -> Iterator[None]:
+    """Have other processes use a processor each, in sessions of their own."""
+    command = [sys.executable, '-c', _BUSY]
+    busy = [subprocess.Popen(command, start_new_session=True) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
 
 
 def _bag(recording: Path, cell: Cell, options: Options) -> Path:
@@ -187,6 +250,11 @@ def live_columns(metrics: Mapping[str, Any]) -> dict[str, Any]:
         text = metrics['nodes'].get(node, {}).get(name)
         if text is not None:
             row[column] = float(text)
+    seconds = float(metrics['nodes'].get('replay', {}).get('played_s', 'nan'))
+    for node in _NODES:
+        used = metrics['nodes'].get(node, {}).get('cpu_s')
+        if used is not None and seconds > 0:
+            row[f'{node}_cpu'] = float(used) / seconds
     row['tracked_percent'] = 100.0 * found['frames'] / max(found['frames_sent'], 1)
     return row
 

@@ -8,9 +8,18 @@ from collections import Counter
 
 
 class Acknowledgements:
-    """Match what was sent with what was acknowledged, across threads."""
+    """
+    Match what was sent with what was acknowledged, across threads.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    passed_over : str
+        The state of a frame that was left out: answered, and missed all the same.
+
+    """
+
+    def __init__(self, passed_over: str = 'passed over') -> None:
+        self._passed_over = passed_over
         self.states: Counter[str] = Counter()
         self.sent = 0
         self.round_trips_ms: list[float] = []
@@ -24,9 +33,14 @@ class Acknowledgements:
         return bool(self.states)
 
     @property
-    def missed(self) -> int:
-        """How many were sent and not acknowledged."""
+    def unanswered(self) -> int:
+        """How many were sent and nothing was heard of."""
         return self.sent - sum(self.states.values())
+
+    @property
+    def missed(self) -> int:
+        """How many were sent and got no answer, or the one that they were left out."""
+        return self.unanswered + self.states[self._passed_over]
 
     def expect(self, stamp_ns: int, sent_s: float) -> None:
         """Note that a frame left at a time of `time.perf_counter`; it may be back already."""
@@ -52,7 +66,8 @@ class Acknowledgements:
 
     def _count(self, state: str, seconds: float) -> None:
         self.states[state] += 1
-        self.round_trips_ms.append(seconds * 1e3)
+        if state != self._passed_over:
+            self.round_trips_ms.append(seconds * 1e3)
 
     def wait(self, stamp_ns: int, timeout_s: float) -> bool:
         """Return whether a frame was acknowledged within a time."""

@@ -35,6 +35,7 @@ class Health:
 
     def __init__(self, node: Node, name: str) -> None:
         self.counts: Counter[str] = Counter()
+        self._begun_s = time.process_time()  # what starting took is another matter
         self._node = node
         self._name = name
         self._timings_ms: dict[str, deque[float]] = {}
@@ -102,8 +103,10 @@ class Health:
     def values(self) -> dict[str, str]:
         """Return counts and timings, as the status carries them."""
         values = {key: str(count) for key, count in sorted(self.counts.items())}
+        values['cpu_s'] = f'{time.process_time() - self._begun_s:.2f}'
         for name, timings in list(self._timings_ms.items()):
             measured = np.array(list(timings))  # one step, while another thread appends
             values[f'{name}_ms_median'] = f'{np.median(measured):.2f}'
             values[f'{name}_ms_p95'] = f'{np.percentile(measured, 95):.2f}'
+            values[f'{name}_ms_max'] = f'{measured.max():.2f}'
         return values

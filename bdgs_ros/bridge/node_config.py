@@ -101,7 +101,12 @@ class TrackingNodeConfig(GraphConfig):
     labels_max_age_s: float = param(
         0.5, 'older labels are not used (realtime)', unit='s', low=0.0, high=10.0
     )
-    frame_queue: int = param(15, 'frames that may wait for tracking (realtime)', low=1, high=1000)
+    realtime_priority: int = param(
+        1,
+        "of tracking's threads, SCHED_RR, if the system grants it (docs/realtime.md); 0: never",
+        low=0,
+        high=90,
+    )
     map_file: str = param(
         '', 'where bdgs/save_map writes and bdgs/load_map reads; may change at run time'
     )

@@ -32,6 +32,10 @@ class Pace:
         self._due_ns = max(self._due_ns + self._period_ns, stamp_ns + self._period_ns / 2)
         return True
 
+    def set_rate(self, rate_hz: float) -> None:
+        """Choose more or fewer from now on."""
+        self._period_ns = NS_PER_S / rate_hz
+
     def reset(self) -> None:
         """The next image is chosen."""
         self._due_ns = None

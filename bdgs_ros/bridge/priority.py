@@ -4,8 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import os
+import resource
+import signal
 import sys
 import threading
+from pathlib import Path
+
+_LONGEST_RUN_US = 1_000_000
+"""A real-time thread that computes for so long without sleeping is one no longer."""
 
 
 def give_way(nice: int) -> None:
@@ -20,8 +26,60 @@ def give_way(nice: int) -> None:
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), nice)
 
 
+def go_first(priority: int) -> str:
+    """
+    Let all threads of this process run before any that has no real-time priority.
+
+    Where a thread does not sleep for a second, the kernel says so (`RLIMIT_RTTIME`), and the
+    process has ordinary priorities from then on: it can never take a processor for good.
+
+    Parameters
+    ----------
+    priority : int
+        Of `SCHED_RR`, 1 to 99; 0 does nothing.
+
+    Returns
+    -------
+    note : str
+        What was granted, for the log; empty for priority 0.
+
+    """
+    if not priority:
+        return ''
+    if not sys.platform.startswith('linux') or processors() < 2:
+        return 'real-time scheduling: not on this system; ordinary priorities'
+    try:
+        _bound_run_time()
+        _schedule(os.SCHED_RR, priority)
+    except (OSError, ValueError) as error:
+        _schedule(os.SCHED_OTHER, 0)
+        return (
+            f'real-time scheduling was not granted ({error}); ordinary priorities. '
+            'docs/realtime.md says what to allow'
+        )
+    return f'real-time scheduling: SCHED_RR, priority {priority}'
+
+
+def _bound_run_time() -> None:
+    _, hard = resource.getrlimit(resource.RLIMIT_RTTIME)
+    soft = _LONGEST_RUN_US if hard == resource.RLIM_INFINITY else min(_LONGEST_RUN_US, hard)
+    resource.setrlimit(resource.RLIMIT_RTTIME, (soft, hard))
+    signal.signal(signal.SIGXCPU, lambda *_: _schedule(os.SCHED_OTHER, 0))
+
+
+def _schedule(policy: int, priority: int) -> None:
+    """Schedule all threads of this process in one way; those they start follow them."""
+    for task in Path('/proc/self/task').iterdir():
+        with contextlib.suppress(ProcessLookupError):  # it has ended
+            os.sched_setscheduler(int(task.name), policy, os.sched_param(priority))
+
+
 def leave_one(threads: int) -> int:
     """Return how many of the threads run at once if one processor is left to others."""
-    affinity = getattr(os, 'sched_getaffinity', None)  # what this process may use; Linux
-    processors = len(affinity(0)) if affinity else os.cpu_count() or 1
-    return max(1, min(threads, processors - 1))
+    return max(1, min(threads, processors() - 1))
+
+
+def processors() -> int:
+    """Return how many processors this process may use."""
+    affinity = getattr(os, 'sched_getaffinity', None)  # Linux
+    return len(affinity(0)) if affinity else os.cpu_count() or 1

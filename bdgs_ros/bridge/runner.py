@@ -15,7 +15,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from bdgs_ros.bridge import transport
-from bdgs_ros.bridge.priority import give_way
+from bdgs_ros.bridge.priority import give_way, go_first
 from bdgs_ros.core.errors import BdgsError
 
 PARENT_VARIABLE = 'BDGS_PARENT_PID'
@@ -34,6 +34,8 @@ class GraphNode(Node):
         self.finished = False
         self.nice = 0
         """How much its callbacks give way to other processes; workers have their own."""
+        self.realtime_priority = 0
+        """Of all threads of its process, see `priority.go_first`."""
 
     def finish(self, exit_code: int = 0) -> None:
         """End the process from any thread, when the current callback is over."""
@@ -77,6 +79,9 @@ def run(
     try:
         node = factory()
         give_way(node.nice)
+        note = go_first(node.realtime_priority)
+        if note:
+            node.get_logger().info(note)
         executor = make_executor()
         executor.add_node(node)
         while not (node.finished or stop):

@@ -18,6 +18,8 @@ class FrameState(Enum):
     SKIPPED = 'skipped'
     """It could not be used; the reason is in the log and the diagnostics."""
     PAUSED = 'paused'
+    PASSED_OVER = 'passed over'
+    """Tracking was behind, and a newer image was there."""
 
 
 _LEVELS = {
@@ -25,6 +27,7 @@ _LEVELS = {
     FrameState.LOST: DiagnosticStatus.ERROR,
     FrameState.SKIPPED: DiagnosticStatus.WARN,
     FrameState.PAUSED: DiagnosticStatus.OK,
+    FrameState.PASSED_OVER: DiagnosticStatus.WARN,
 }
 
 

@@ -19,6 +19,8 @@ KEYFRAMES = 'bdgs/keyframes'
 STATUS = 'bdgs/status'
 """One message per image that tracking took: the acknowledgement that lockstep waits for."""
 KEYFRAME = 'bdgs/keyframe'
+SHED = 'bdgs/shed'
+"""What is to be left out so that tracking keeps up, see `bridge.governor`."""
 MOVE = 'bdgs/move'
 """By what tracking moved the present before a frame: it learnt where its keyframes are."""
 MODEL_IMAGE = 'bdgs/model/image'

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Generic, TypeVar
 
@@ -26,6 +26,11 @@ class Worker(Generic[Item]):
         Called with what `handle` raised; the thread goes on.
     capacity : int or None
         Items that may wait; the oldest is dropped for a newer one. None: all wait.
+    is_late : callable, optional
+        Asked of the oldest item that waits, while newer ones do: whether it has waited for too
+        long. Then the newest is handled and the others are dropped.
+    on_drop : callable, optional
+        Called with each item that is dropped, by whichever thread drops it.
     idle : callable, optional
         Called after every item and `idle_period_s` after the last call while nothing is to do.
     idle_period_s : float
@@ -46,8 +51,12 @@ class Worker(Generic[Item]):
         idle_period_s: float = 0.1,
         nice: int = 0,
         source: Worker[Any] | None = None,
+        is_late: Callable[[Item], bool] = lambda item: False,
+        on_drop: Callable[[Item], None] = lambda item: None,
     ) -> None:
         self.dropped = 0
+        self._is_late = is_late
+        self._on_drop = on_drop
         self._handle = handle
         self._on_error = on_error
         self._capacity = capacity
@@ -71,12 +80,13 @@ class Worker(Generic[Item]):
 
     def put(self, item: Item) -> None:
         """Append an item; never waits."""
+        dropped = []
         with self._changed:
             if self._capacity is not None and len(self._items) >= self._capacity:
-                self._items.popleft()
-                self.dropped += 1
+                dropped.append(self._items.popleft())
             self._items.append(item)
             self._changed.notify_all()
+        self._drop(dropped)
 
     def wake(self) -> None:
         """Have `idle` called soon, when nothing else is to do."""
@@ -135,7 +145,21 @@ class Worker(Generic[Item]):
             if self._first is not None:
                 action, self._first = self._first, None
                 return action
-            return partial(self._handle, self._items.popleft())
+            dropped = self._pass_over()
+            call = partial(self._handle, self._items.popleft())
+        self._drop(dropped)
+        return call
+
+    def _pass_over(self) -> list[Item]:
+        """Take out all but the newest item if the oldest has waited for too long."""
+        if len(self._items) < 2 or not self._is_late(self._items[0]):
+            return []
+        return [self._items.popleft() for _ in range(len(self._items) - 1)]
+
+    def _drop(self, items: Sequence[Item]) -> None:
+        self.dropped += len(items)
+        for item in items:
+            self._on_drop(item)
 
     def _guarded(self, call: Callable[[], None]) -> None:
         try:

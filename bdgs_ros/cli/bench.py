@@ -49,6 +49,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='slam, accuracy, belief, recovery: cells that run at once, one thread each, no times',
     )
     parser.add_argument(
+        '--beside',
+        type=int,
+        action='append',
+        metavar='N',
+        help='tracking: live beside N processes that use a processor each; repeatable',
+    )
+    parser.add_argument(
+        '--rate',
+        type=float,
+        action='append',
+        metavar='R',
+        help='tracking: live at R times the rate of the recording; repeatable',
+    )
+    parser.add_argument(
         '--data',
         type=Path,
         default=default_data(),
@@ -102,6 +116,8 @@ def run(arguments: argparse.Namespace) -> int:
         values=values,
         all_cells=arguments.all,
         refine_s=arguments.refine_seconds,
+        beside=tuple(arguments.beside or Options.beside),
+        rates=tuple(arguments.rate or Options.rates),
         jobs=arguments.jobs,
     )
     results = run_bench(bench, options, arguments.only, arguments.force)

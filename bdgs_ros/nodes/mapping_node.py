@@ -21,7 +21,9 @@ from bdgs_ros.bridge import conversions, parameters, topics
 from bdgs_ros.bridge.adjuster import Adjuster
 from bdgs_ros.bridge.cdr_image import CdrImage, image_from_cdr
 from bdgs_ros.bridge.frames import FrameDecoder, FrameSource, RawFrame
+from bdgs_ros.bridge.governor import Shed
 from bdgs_ros.bridge.health import Health
+from bdgs_ros.bridge.load import hear_load
 from bdgs_ros.bridge.map_output import MapOutput
 from bdgs_ros.bridge.model_view import ModelPublisher
 from bdgs_ros.bridge.node_config import MappingNodeConfig
@@ -49,6 +51,8 @@ _LABELS_WAIT_S = 0.3
 _LABELS_KEPT = 90
 _MAX_LABEL_AGE_NS = 500_000_000
 _POSES_KEPT = 1000
+_KEYFRAMES_BEHIND = 2
+"""That may wait for the back end: an older one is none to it, its frames go with another."""
 
 
 class MappingNode(GraphNode):
@@ -71,6 +75,7 @@ class MappingNode(GraphNode):
             at_once=not config.lockstep,
         )
         self._tracked: deque[StampedPose] = deque(maxlen=_POSES_KEPT)
+        self._shed = Shed.NOTHING
         self._lock = self._live.lock  # of the mapper: worker and services
         self._frames: StampBuffer[RawFrame] = StampBuffer(config.frame_buffer)
         self._labels: StampBuffer[CdrImage] = StampBuffer(_LABELS_KEPT)
@@ -81,7 +86,10 @@ class MappingNode(GraphNode):
             self, config, self._health, self._live, self._settle, self._on_loaded
         )
         self._adjusting: Worker[Callable[[], None]] = Worker(
-            lambda task: task(), self._health.error, None, nice=config.back_end_nice
+            lambda task: task(),
+            self._health.error,
+            None if config.lockstep else _KEYFRAMES_BEHIND,
+            nice=config.back_end_nice,
         )
         self._worker: Worker[Callable[[], None]] = Worker(
             lambda task: task(),
@@ -112,7 +120,11 @@ class MappingNode(GraphNode):
         self.create_subscription(
             Empty, topics.RESET_EVENT, lambda _: self._forget(), topics.RELIABLE
         )
+        hear_load(self, self._on_load)
         self._keyframes = self.create_publisher(PathMessage, topics.KEYFRAMES, topics.LATCHED)
+
+    def _on_load(self, level: Shed) -> None:
+        self._shed = level
 
     def _keep_frame(self, raw: RawFrame) -> None:
         self._frames.put(raw.stamp_ns, raw)
@@ -165,6 +177,7 @@ class MappingNode(GraphNode):
             if adjustment is not None:
                 self._worker.put(partial(self._map, keyframe, adjustment))
             self._health.counts['keyframes_dropped'] = self._worker.dropped
+            self._health.counts['keyframes_passed_over'] = self._adjusting.dropped
 
     def _answer_nothing(self, stamp_ns: int) -> None:
         """Tell tracking, which waits in lockstep, not to."""
@@ -209,8 +222,10 @@ class MappingNode(GraphNode):
         return found
 
     def _is_hurried(self) -> bool:
+        if self._config.lockstep:
+            return False
         waiting = self._adjusting.waiting + self._worker.waiting
-        return not self._config.lockstep and waiting > 0
+        return waiting > 0 or self._shed >= Shed.ITERATIONS
 
     def _wait_frame(self, stamp_ns: int) -> RawFrame | None:
         timeout_s = self._config.lockstep_timeout_s if self._config.lockstep else _FRAME_WAIT_S
@@ -249,7 +264,8 @@ class MappingNode(GraphNode):
     def _on_idle(self) -> None:
         """Between keyframes: show the map, and save it if that is due."""
         with self._lock:
-            more_to_render = self._output.render(self._mapper)
+            shown = self._shed < Shed.RENDERS or self._mapper.frozen
+            more_to_render = shown and self._output.render(self._mapper)
             self._output.publish_map(self._mapper, self._live.version, self._config.belief.margin)
         self._map_services.save_if_due()
         if more_to_render:

@@ -21,7 +21,7 @@ from bdgs_ros.bridge.playback import Pair, Playback, flush, pair_up
 from bdgs_ros.bridge.raw_publishers import RawPublishers
 from bdgs_ros.bridge.runner import REFUSED, GraphNode, run
 from bdgs_ros.bridge.services import serve_switch, serve_trigger
-from bdgs_ros.bridge.status import status_from_message
+from bdgs_ros.bridge.status import FrameState, status_from_message
 from bdgs_ros.core.errors import BdgsError, ConfigError
 from bdgs_ros.data.bag import open_bag
 from bdgs_ros.data.bag_cursor import RawMessage
@@ -31,7 +31,7 @@ _POLL_S = 0.05
 _SETTLE_S = 0.3
 """A subscriber that we know of may not know of us yet."""
 _RESEND_S = 5.0
-_QUIET_S = 2.0
+_QUIET_S = 1.0
 _SENT_KEPT = 200
 
 
@@ -51,7 +51,7 @@ class ReplayNode(GraphNode):
         self._reader = open_bag(config.bag)
         self._playback = Playback(self._reader, config)
         self._health = Health(self, 'replay')
-        self._acks = Acknowledgements()
+        self._acks = Acknowledgements(FrameState.PASSED_OVER.value)
         self._raw = RawPublishers(
             self, self._playback.topics, self._playback.layout, topics.image_qos(config.qos)
         )
@@ -60,6 +60,8 @@ class ReplayNode(GraphNode):
         self._running = threading.Event()
         self._stopping = False
         self._steps = 0
+        self._played_s = 0.0
+        self._last_sent_s = 0.0
         self._sent_s: OrderedDict[tuple[str, int], float] = OrderedDict()
         if not config.paused:
             self._running.set()
@@ -104,6 +106,7 @@ class ReplayNode(GraphNode):
 
     def _play_realtime(self) -> None:
         """Send every message at its time; who cannot keep up misses it."""
+        began_s = time.time()
         started_s: float | None = None
         pairing = self._playback.make_pairing()
         layout = self._playback.layout
@@ -119,6 +122,7 @@ class ReplayNode(GraphNode):
                     self._expect(pair)
         for pair in flush(pairing):
             self._expect(pair)
+        self._played_s = self._last_sent_s - began_s
         self._acks.wait_quiet(_QUIET_S)
 
     def _expect(self, pair: Pair) -> None:
@@ -161,6 +165,7 @@ class ReplayNode(GraphNode):
         self._check_stopping()
         self._clock_publisher.publish(Clock(clock=conversions.time_message(message.stamp_ns)))
         self._raw.publish(message)
+        self._last_sent_s = time.time()
         self._sent_s[message.topic, message.stamp_ns] = time.perf_counter()
         while len(self._sent_s) > _SENT_KEPT:
             self._sent_s.popitem(last=False)
@@ -202,11 +207,15 @@ class ReplayNode(GraphNode):
             self._health.add_timing('image_to_status', milliseconds)
         self._health.counts['frames_sent'] = acks.sent
         self._health.counts['frames_missed_by_tracking'] = acks.missed
-        if acks.missed:
+        if acks.unanswered:
             self._raw.wait_delivered(_QUIET_S)
         self._health.publish()
         if self._config.report_file:  # a short replay may end before its topics are discovered
-            text = json.dumps(self._health.values(), indent=1)
+            times = {
+                'played_s': f'{self._played_s:.2f}',
+                'last_sent_s': f'{self._last_sent_s:.2f}',
+            }
+            text = json.dumps({**self._health.values(), **times}, indent=1)
             write_text_atomically(Path(self._config.report_file), text)
 
     def _on_pause(self, paused: bool) -> str:

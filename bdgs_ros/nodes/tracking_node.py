@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,9 @@ from std_msgs.msg import Empty
 from bdgs_ros.bridge import parameters, topics
 from bdgs_ros.bridge.feedback import Feedback
 from bdgs_ros.bridge.frames import FrameDecoder, FrameSource, RawFrame
+from bdgs_ros.bridge.governor import Shed
 from bdgs_ros.bridge.health import Health
+from bdgs_ros.bridge.load import LoadWatch
 from bdgs_ros.bridge.node_config import TrackingNodeConfig
 from bdgs_ros.bridge.pose_output import PoseOutput
 from bdgs_ros.bridge.runner import GraphNode, run
@@ -27,6 +30,7 @@ from bdgs_ros.data.trajectory_io import write_trajectory
 from bdgs_ros.mapping.map_files import load_places
 from bdgs_ros.tracking.camera_tracker import CameraTracker
 
+_MOST_WAITING = 30  # frames, however slow tracking is; it takes the newest of them
 _AT_RUN_TIME = ('map_file', 'trajectory_file')
 
 
@@ -40,6 +44,7 @@ class TrackingNode(GraphNode):
         self._config = config
         self._paused = False
         self._has_begun = False
+        self._keyframes = 0
         self._health = Health(self, 'tracking')
         self._tracker = CameraTracker(config.tracking)
         self._output = PoseOutput(self, config)
@@ -47,14 +52,28 @@ class TrackingNode(GraphNode):
         self._reset_event = self.create_publisher(Empty, topics.RESET_EVENT, topics.RELIABLE)
         self._feedback = Feedback(self, config, self._health)
         self._decoder = FrameDecoder.of(self)
+        self._load = LoadWatch(self, self._health)
+        self.realtime_priority = 0 if config.lockstep else config.realtime_priority
         self._worker: Worker[RawFrame] = Worker(
-            self._on_frame, self._health.error, None if config.lockstep else config.frame_queue
+            self._on_frame,
+            self._health.error,
+            None if config.lockstep else _MOST_WAITING,
+            is_late=self._load.is_late,
+            on_drop=self._on_passed_over,
         )
         serve_trigger(self, topics.RESET, self._on_reset)
         serve_switch(self, topics.PAUSE, self._on_pause)
         serve_trigger(self, topics.SAVE_TRAJECTORY, self._on_save)
-        self._source = FrameSource(self, config, self._health, self._worker.put, self._forget)
+        self._source = FrameSource(self, config, self._health, self._put, self._forget)
         self.get_logger().info(f'tracking is ready: mode {config.mode}')
+
+    def _put(self, raw: RawFrame) -> None:
+        self._load.note_arrival(raw)
+        self._worker.put(raw)
+
+    def _on_passed_over(self, raw: RawFrame) -> None:
+        self._load.note_passed_over()
+        self._finish(raw, FrameStatus(raw.stamp_ns, FrameState.PASSED_OVER))
 
     def _on_frame(self, raw: RawFrame) -> None:
         if self._feedback.map_was_replaced():
@@ -119,13 +138,24 @@ class TrackingNode(GraphNode):
         started = time.perf_counter()
         result = self._tracker.process(frame, labels, self._is_hurried())
         tracking_ms = (time.perf_counter() - started) * 1e3
+        result = self._announced(result)
         if result.status is TrackingStatus.OK:
             self._feedback.note_keyframe(result, frame.camera)
             self._output.publish(result, raw.color.header.frame_id)
         latency_ms = (time.monotonic() - raw.received_s) * 1e3
+        self._load.note_pose(raw)
         if result.is_keyframe and self._config.lockstep:
             self._tracker.set_model(self._feedback.wait_model(result.stamp_ns))
         self._report(raw, result, tracking_ms, latency_ms)
+
+    def _announced(self, result: TrackingResult) -> TrackingResult:
+        """Under the greatest load every other keyframe is one to tracking alone."""
+        if not result.is_keyframe or self._config.lockstep:
+            return result
+        self._keyframes += 1
+        is_left_out = self._load.level >= Shed.KEYFRAMES and self._keyframes % 2 == 0
+        self._health.counts['keyframes_left_out'] += is_left_out
+        return replace(result, is_keyframe=not is_left_out)
 
     def _is_hurried(self) -> bool:
         return not self._config.lockstep and self._worker.waiting > 0

@@ -1,0 +1,125 @@
+"""
+What is left out when the machine is short, in which order; ROS-free.
+
+Tracking sees first that there is not enough of the machine: frames wait for it. Its governor
+knows the frame period and how long poses took lately, and raises or lowers a level by one step
+at a time; the other nodes hear the level and leave out what stands at or below it. Tracking
+is the last to lose: only a frame that has waited for two periods while newer ones are there
+is passed over.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from enum import IntEnum
+
+import numpy as np
+
+_INTERVALS = 31  # arrivals that tell the period
+_POSES, _LEAST_POSES = 30, 10  # that tell how late they are
+_LONGEST_PERIOD_S = 0.5  # of a camera that SLAM is done with
+_DECIDE_S = 0.5  # between two changes
+_CALM_S = 2.0  # without pressure before a step is given back
+_PRESSED = 1.5  # periods from image to pose, at the 90th percentile: too many
+_AT_EASE = 1.0  # periods: there is room
+_LATE = 2.0  # periods that a frame may wait while newer ones are there
+
+
+class Shed(IntEnum):
+    """What is left out, and with it everything above."""
+
+    NOTHING = 0
+    RENDERS = 1
+    """Views of the map for people."""
+    ITERATIONS = 2
+    """Most iterations of the map at the finest level."""
+    LABELS = 3
+    """Half of the detector's images."""
+    PAIRS = 4
+    """All pairs of the back end but those of neighbours; the others are joined later."""
+    KEYFRAMES = 5
+    """Every other keyframe."""
+
+    @property
+    def words(self) -> str:
+        """For diagnostics."""
+        names = [step.name.lower() for step in Shed if Shed.NOTHING < step <= self]
+        return ', '.join(names) or 'nothing'
+
+
+class Governor:
+    """
+    Watches how late poses are, and says what is to be left out.
+
+    Times are of one monotonic clock, in seconds.
+    """
+
+    def __init__(self) -> None:
+        self.level = Shed.NOTHING
+        self.reason = ''
+        """Why the level is not zero, with numbers."""
+        self._arrivals: deque[float] = deque(maxlen=_INTERVALS)
+        self._ages_s: deque[float] = deque(maxlen=_POSES)  # of images when their poses came
+        self._passed_over = 0  # since the last change
+        self._changed_s = -np.inf
+        self._pressed_s = -np.inf
+
+    @property
+    def period_s(self) -> float:
+        """Of the frames as they arrive: the median of the last ones."""
+        if len(self._arrivals) < 3:
+            return _LONGEST_PERIOD_S
+        return min(float(np.median(np.diff(self._arrivals))), _LONGEST_PERIOD_S)
+
+    def note_arrival(self, now_s: float) -> None:
+        """Note that a frame has come."""
+        if self._arrivals and now_s - self._arrivals[-1] > 2 * _LONGEST_PERIOD_S:
+            self._arrivals.clear()  # a pause is no period
+        self._arrivals.append(now_s)
+
+    def is_late(self, received_s: float, now_s: float) -> bool:
+        """Return whether a frame has waited for so long that a newer one is worth more."""
+        return now_s - received_s > _LATE * self.period_s
+
+    def note_passed_over(self) -> None:
+        """Note that a frame was passed over."""
+        self._passed_over += 1
+
+    def note_pose(self, received_s: float, now_s: float) -> bool:
+        """Note that a frame is done; return whether the level has changed."""
+        self._ages_s.append(now_s - received_s)
+        if len(self._ages_s) < _LEAST_POSES or now_s - self._changed_s < _DECIDE_S:
+            return False
+        pressure = self._pressure()
+        if pressure:
+            self._pressed_s = now_s
+        return self._step(pressure, now_s)
+
+    def _pressure(self) -> str:
+        """Say why something must be left out; nothing where poses are in time."""
+        if self._passed_over:
+            return f'{self._passed_over} frames were passed over'
+        if self._late_periods() > _PRESSED:
+            late_ms = 1e3 * self._late_periods() * self.period_s
+            return f'poses come {late_ms:.0f} ms after their images'
+        return ''
+
+    def _late_periods(self) -> float:
+        return float(np.percentile(self._ages_s, 90)) / max(self.period_s, 1e-3)
+
+    def _step(self, pressure: str, now_s: float) -> bool:
+        """Go one step up or down; what it changes is looked at anew."""
+        before = self.level
+        if pressure:
+            self.level = Shed(min(self.level + 1, max(Shed)))
+            self.reason = pressure
+        elif now_s - self._pressed_s > _CALM_S and self._late_periods() < _AT_EASE:
+            self.level = Shed(max(self.level - 1, min(Shed)))
+        self._passed_over = 0
+        if self.level == before:
+            return False
+        self._changed_s = now_s
+        self._ages_s.clear()
+        if self.level is Shed.NOTHING:
+            self.reason = ''
+        return True

@@ -1,0 +1,65 @@
+"""Real-time scheduling: granted or not, and never a processor for good."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+linux = pytest.mark.skipif(not sys.platform.startswith('linux'), reason='Linux schedulers')
+_GRANTED = 'SCHED_RR, priority'
+
+
+def run(code: str) -> str:
+    """Run code in a process of its own, whose scheduling may change."""
+    text = 'import os, threading, time\nfrom bdgs_ros.bridge.priority import go_first\n' + code
+    done = subprocess.run(
+        [sys.executable, '-c', text], capture_output=True, text=True, timeout=60, check=True
+    )
+    return done.stdout.strip()
+
+
+@linux
+def test_all_threads_go_first_where_the_system_grants_it() -> None:
+    code = """
+policies = []
+go = threading.Event()
+def look():
+    go.wait()
+    policies.append(os.sched_getscheduler(threading.get_native_id()))
+thread = threading.Thread(target=look)
+thread.start()
+note = go_first(1)
+go.set()
+thread.join()
+later = threading.Thread(target=look)
+later.start()
+later.join()
+print(note, policies == [os.SCHED_RR] * 2, policies == [os.SCHED_OTHER] * 2)
+"""
+    note = run(code)
+    granted = _GRANTED in note
+    assert note.endswith('True False' if granted else 'False True')
+    assert granted or 'ordinary priorities' in note
+
+
+@linux
+@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason='one processor')
+def test_a_thread_that_never_sleeps_is_ordinary_again() -> None:
+    code = """
+note = go_first(1)
+end = time.monotonic() + 3
+while time.monotonic() < end and os.sched_getscheduler(0) != os.SCHED_OTHER:
+    pass
+print(note, os.sched_getscheduler(0) == os.SCHED_OTHER)
+"""
+    found = run(code)
+    if _GRANTED not in found:
+        pytest.skip('real-time scheduling is not granted here')
+    assert found.endswith('True')
+
+
+def test_priority_zero_asks_for_nothing() -> None:
+    assert run('print(repr(go_first(0)))') == "''"
