@@ -37,7 +37,7 @@ live_beside1: beside one process, in a session of its own, that uses one process
 replayed twice as fast; _no_rr: with ordinary priorities. CPU: processor seconds per second of
 replay.
 """
-_NODES = ('tracking', 'detection', 'mapping')
+_NODES = ('tracking', 'detection', 'mapping', 'replay')
 TABLES = {
     'Alone': (
         *('alone_ate_cm', 'alone_ms', 'alone_p95_ms'),

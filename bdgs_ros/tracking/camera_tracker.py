@@ -208,6 +208,7 @@ class CameraTracker:
         if self._keyframe is None and not self._is_lost:
             return self._begin(frame, current, prior)
         self._choice.count()
+        self._loss.turn_rad_s = float(np.linalg.norm(self._motion.velocity[3:]))
         first: Attempt | None = None
         for start in self._starts(frame, prior, hurried):
             attempt = self._attempt(start, frame.stamp_ns, current, prior)
@@ -376,7 +377,14 @@ class CameraTracker:
         if not self._is_lost:
             objection = self._loss.objection(attempt.best.quality)
             _log.warning('lost at stamp %d ns: %s', frame.stamp_ns, objection)
-        self._hypothesis = None
+        # A blurred frame is doubtful, and the next ones are found from where it seems to be; from
+        # a prediction that is older with every frame they would not.
+        found, is_doubtful = attempt.best, self._loss.is_doubtful(attempt.best.quality)
+        self._hypothesis = (
+            Hypothesis(frame.stamp_ns, found.T_world_camera, attempt.start)
+            if is_doubtful
+            else None
+        )
         return self._lost(frame, attempt)
 
     def _lost(self, frame: RgbdFrame, attempt: Attempt) -> TrackingResult:

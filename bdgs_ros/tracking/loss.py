@@ -18,6 +18,7 @@ from bdgs_ros.core.types import DepthImage, ProbabilityImage
 from bdgs_ros.tracking.align import AlignResult
 
 _MEMORY = 20  # frames that say what is usual
+_FAST_RAD_S, _BLUR = 1.5, 0.25  # a turn that blurs, and how much less then agrees
 _LEAST_MEMORY = 3
 _STRIDE = 4  # pixels; a share needs no more
 _USUAL = 0.8  # inlier ratio, where no frame was tracked yet
@@ -51,6 +52,8 @@ class LossTest:
         self._config = config
         self._ratios: deque[float] = deque(maxlen=_MEMORY)
         self._usual = _USUAL
+        self.turn_rad_s = 0.0
+        """How fast the camera turns, as far as is known before a frame is aligned."""
 
     def reset(self) -> None:
         """Forget what was usual."""
@@ -84,11 +87,26 @@ class LossTest:
             return f'only {100 * found.coverage:.1f} % of the image could be compared'
         if found.inlier_ratio < limits.inlier_ratio:
             return f'{100 * found.inlier_ratio:.0f} % inliers'
-        if self._ratios and found.relative_ratio < limits.relative_ratio:
+        if self._ratios and found.relative_ratio < self._least_relative():
             return f'inliers fell from {100 * self._usual:.0f} to {100 * found.inlier_ratio:.0f} %'
         if found.sigma_m > limits.sigma_m:
             return f'the images leave the position open to {found.sigma_m:.2f} m'
         return ''
+
+    def _least_relative(self) -> float:
+        """Images that the camera's own turn blurs agree less, and are not wrong for it."""
+        turning = min(self.turn_rad_s / _FAST_RAD_S, 1.0)
+        return self._config.relative_ratio * (1 - _BLUR * turning)
+
+    def is_doubtful(self, quality: AlignResult) -> bool:
+        """Tell whether nothing speaks against a pose but that the images usually agree better."""
+        limits, found = self._config, self.evidence(quality)
+        return bool(
+            1 / limits.gain < found.gain < limits.gain
+            and found.coverage >= limits.coverage
+            and found.inlier_ratio >= limits.inlier_ratio
+            and found.sigma_m <= limits.sigma_m
+        )
 
     def is_sure(self, quality: AlignResult) -> bool:
         """Tell whether one such frame is enough to be found after a loss."""

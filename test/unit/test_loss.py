@@ -55,6 +55,26 @@ def test_what_is_usual_decides_what_is_too_little() -> None:
     assert not usual(0.65).objection(aligned(0.6))
 
 
+def test_a_turn_that_blurs_excuses_a_little() -> None:
+    test = usual(0.9)
+    assert test.objection(aligned(inliers=0.6))
+    test.turn_rad_s = 2.0
+    assert test.objection(aligned(inliers=0.6)) == ''
+    assert test.objection(aligned(inliers=0.4))  # the limit for all frames stands
+    high = LossTest(LossConfig(inlier_ratio=0.1))
+    for _ in range(10):
+        high.accept(aligned(0.9))
+    high.turn_rad_s = 100.0
+    assert high.objection(aligned(inliers=0.45))
+
+
+def test_doubtful_is_what_only_the_frames_before_speak_against() -> None:
+    test = usual(0.9)
+    assert test.is_doubtful(aligned(inliers=0.6))
+    for wrong in (aligned(0.45), aligned(coverage=0.03), aligned(gain=5), aligned(sigma_m=0.4)):
+        assert not test.is_doubtful(wrong)
+
+
 def test_sure_is_as_good_as_before_the_loss() -> None:
     test = usual(0.9)
     assert test.is_sure(aligned(0.85))
