@@ -17,6 +17,7 @@ Matrix = NDArray[np.float64]
 Vector = NDArray[np.float64]
 
 _SMALL_ANGLE_RAD = 1e-6
+_RIGID = 1e-3  # float32 and many products stay within a tenth of that
 
 
 def identity() -> Matrix:
@@ -91,6 +92,16 @@ def orthonormalise(T_a_b: Matrix) -> Matrix:
     """Project the rotation part back onto SO(3) after many products."""
     u, _, vt = np.linalg.svd(T_a_b[:3, :3])
     return from_rotation_translation(u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt, T_a_b[:3, 3])
+
+
+def are_rigid(T_a_b: Matrix) -> bool:
+    """Return whether matrices, shape (..., 4, 4), are motions: finite, and no scale or mirror."""
+    if not np.isfinite(T_a_b).all():
+        return False
+    rotation = T_a_b[..., :3, :3]
+    square = rotation @ np.swapaxes(rotation, -1, -2)
+    is_turn = np.allclose(square, np.eye(3), atol=_RIGID) and (np.linalg.det(rotation) > 0).all()
+    return bool(is_turn and (T_a_b[..., 3, :] == [0, 0, 0, 1]).all())
 
 
 def view_distances(poses: Sequence[Matrix], metres_per_radian: float) -> Matrix:
