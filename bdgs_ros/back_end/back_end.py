@@ -8,6 +8,7 @@ all poses and the camera's calibration are solved for (`graph`).
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,8 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bdgs_ros.back_end.calibration import Calibration, Known
+from bdgs_ros.back_end.check import objection
 from bdgs_ros.back_end.corners import Corners, Shared, View, find_corners, follow, overlap
-from bdgs_ros.back_end.graph import Edge, solve
+from bdgs_ros.back_end.graph import Edge, Solution, relative_errors, solve
 from bdgs_ros.back_end.loop import LoopDetector, Recognised, agree
 from bdgs_ros.back_end.pair import PairFactor, condense
 from bdgs_ros.back_end.velocity import velocity_at
@@ -28,6 +30,8 @@ from bdgs_ros.core.types import Keyframe, Pose
 
 Array = NDArray[np.float64]
 
+_log = logging.getLogger(__name__)
+
 _RECENT = 300  # poses of frames: keyframes may come late
 _RENEWED = 12  # pairs condensed again at a keyframe, at most
 _OFF_RAD = 0.002  # how far the images of a pair may be bent otherwise than it was condensed with
@@ -36,6 +40,10 @@ _LEAST_SIGMA_S = 0.001
 _SAVED_SIGMA_S = 0.002  # of a readout that a map was saved with
 _NEAR_M, _NEAR_RAD = 2.0, 0.8  # keyframes further apart are not asked what they share
 _FEW_INLIERS = 0.5  # of the followed corners, for a recognised place to be believed
+_FAR_M, _FAR_RAD = 1.0, 0.5  # from where its corners were followed: no pair is there
+_FASTEST = (5.0, 10.0)  # m/s and rad/s; a hand is slower, a correction amid the frames is not
+_TRIES = 3  # of a solution that is refused, each without the pairs that fit worst
+_FITS_AS_BADLY = 0.1  # as the worst
 _METRES_PER_RADIAN = 2.0  # a turn moves the view as far as this at usual depths
 
 
@@ -70,6 +78,10 @@ class BackEnd:
         self._known = Known(self.calibration, self._readout_sigma_s)
         self.loops = 0
         """How many recognised places were joined."""
+        self.refusals = 0
+        """How many solutions were not believed; all poses stayed where they were."""
+        self.refused_in_row = 0
+        """How many since the last one that was."""
         self._recent: deque[tuple[int, Pose]] = deque(maxlen=_RECENT)
         self._views: dict[int, View] = {}
         self._poses: dict[int, Pose] = {}
@@ -105,16 +117,19 @@ class BackEnd:
         -------
         transforms : dict of int to ndarray, shape (4, 4)
             `T_new_old` in world by stamp, of all keyframes that ever were; empty where nothing
-            moves.
+            moves, or where nothing that was found can be believed.
 
         """
         if not self._config.bundle.enabled:
             return {}
         stamp_ns = keyframe.frame.stamp_ns
+        if not se3.are_rigid(np.array([keyframe.T_world_camera, *poses.values()])):
+            self._refuse('keyframes came with poses that are no motions')
+            return {}
         self._poses = {known: poses.get(known, pose) for known, pose in self._poses.items()}
         self.observe(stamp_ns, keyframe.T_world_camera)
         self._follow_velocity()
-        view = View.of(keyframe, velocity_at(stamp_ns, self._recent))
+        view = View.of(keyframe, self._velocity(stamp_ns))
         corners = find_corners(view, self._config.bundle)
         self._poses[stamp_ns], self._views[stamp_ns] = keyframe.T_world_camera, view
         for other in self._partners(corners):
@@ -147,8 +162,13 @@ class BackEnd:
         if not self._views:
             return
         stamp_ns, view = next(reversed(self._views.items()))
+        self._views[stamp_ns] = replace(view, twist=self._velocity(stamp_ns))
+
+    def _velocity(self, stamp_ns: int) -> Array:
+        """Return (v, w) at a keyframe, 0 where the poses around it jump."""
         twist = velocity_at(stamp_ns, self._recent)
-        self._views[stamp_ns] = replace(view, twist=twist)
+        is_slow = np.linalg.norm(twist.reshape(2, 3), axis=1) < _FASTEST
+        return twist if is_slow.all() else np.zeros(6)
 
     def _relative(self, other: int, one: int) -> Pose:
         """Return T_other_one as it is now."""
@@ -174,7 +194,7 @@ class BackEnd:
         if len(shared) < config.least_shared:
             return False
         factor = self._condense(shared, corners.view.stamp_ns, other, T_other_one)
-        if factor.inliers < _FEW_INLIERS * len(shared):
+        if not _is_credible(factor, shared, T_other_one):
             return False
         self._pairs[corners.view.stamp_ns, other] = _Pair(shared, factor)
         return True
@@ -220,6 +240,8 @@ class BackEnd:
                 pair = self._pairs[one, other]
                 start = pair.factor.T_other_one
                 pair.factor = self._condense(pair.shared, one, other, start)
+                if not _is_credible(pair.factor, pair.shared, start):
+                    del self._pairs[one, other]
 
     def _off_rad(self, key: tuple[int, int]) -> float:
         """Return how far the images of a pair are bent otherwise than it was condensed with."""
@@ -235,15 +257,10 @@ class BackEnd:
     def _solve(self) -> dict[int, Pose]:
         """Solve for all poses; return what moves by enough."""
         stamps = list(self._poses)
-        place = {stamp_ns: i for i, stamp_ns in enumerate(stamps)}
-        edges = [
-            Edge(place[one], place[other], pair.factor)
-            for (one, other), pair in self._pairs.items()
-        ]
-        if not edges:
-            return {}
         before = [self._poses[stamp_ns] for stamp_ns in stamps]
-        solution = solve(before, edges, self.calibration, self._known, self._config.bundle)
+        solution = self._believed(stamps, before) if self._pairs else None
+        if solution is None:
+            return {}
         self.calibration = solution.calibration
         sigma_s = max(_OVERCONFIDENT * solution.readout_sigma_s, _LEAST_SIGMA_S)
         self._readout_sigma_s = min(sigma_s, self._known.readout_sigma_s)
@@ -263,6 +280,32 @@ class BackEnd:
         self._recent = deque([(s, T_new_old @ T) for s, T in self._recent], maxlen=_RECENT)
         return moved | {gone: moved[self._leader(gone)] for gone in self._follows}
 
+    def _believed(self, stamps: Sequence[int], before: Sequence[Pose]) -> Solution | None:
+        """Solve; without the pairs that fit worst if it cannot be believed with them."""
+        place = {stamp_ns: i for i, stamp_ns in enumerate(stamps)}
+        keys, why = list(self._pairs), ''
+        for _ in range(_TRIES):
+            edges = [Edge(place[one], place[o], self._pairs[one, o].factor) for one, o in keys]
+            given = self.calibration, self._known, self._config.bundle
+            solution = solve(before, edges, *given)
+            why = objection(before, solution, edges, *given)
+            if not why:
+                self._pairs = {key: self._pairs[key] for key in keys}
+                self.refused_in_row = 0
+                return solution
+            error = relative_errors(before, edges, self.calibration, scale=1.0)
+            fits = error < _FITS_AS_BADLY * error.max()
+            keys = [key for key, is_kept in zip(keys, fits, strict=True) if is_kept]
+            if not keys:
+                break
+        self._refuse(why)
+        return None
+
+    def _refuse(self, why: str) -> None:
+        self.refusals += 1
+        self.refused_in_row += 1
+        _log.warning('correction refused (%d so far): %s', self.refusals, why)
+
     def _leader(self, stamp_ns: int) -> int:
         while stamp_ns in self._follows:
             stamp_ns = self._follows[stamp_ns]
@@ -281,6 +324,16 @@ class BackEnd:
         self._loop.forget(gone)
         self._follows[gone] = leader
         self._pairs = {key: pair for key, pair in self._pairs.items() if gone not in key}
+
+
+def _is_credible(factor: PairFactor, shared: Shared, T_other_one: Pose) -> bool:
+    """Return whether a pair fits its corners, and not by going elsewhere."""
+    numbers = [factor.information.ravel(), factor.gradient, factor.T_other_one.ravel()]
+    if not np.isfinite(np.concatenate(numbers)).all():
+        return False
+    change = factor.T_other_one @ se3.inverse(T_other_one)
+    is_near = np.linalg.norm(change[:3, 3]) < _FAR_M and se3.rotation_angle_rad(change) < _FAR_RAD
+    return bool(is_near and factor.inliers >= _FEW_INLIERS * len(shared))
 
 
 def _are_near(T: Pose) -> bool:

@@ -1,18 +1,20 @@
 """
 All keyframes at once: the poses and the calibration that suit every pair best.
 
+Levenberg and Marquardt's method: a step is taken only where it lowers the cost, else it is damped.
 The normal equations are dense and solved by Cholesky's method; keyframes are bounded in number,
-and 100 of them with 1,000 pairs cost 15 ms per round on one core.
+and 100 of them with 1,000 pairs cost 11 ms per round on one core.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
 from bdgs_ros.back_end.calibration import SIZE, Calibration, Known
@@ -28,7 +30,12 @@ _ROUNDS = 10
 _SETTLED = 1e-4  # m and rad
 _TOLERANCE = 9.0  # medians of the pairs' errors beyond which a pair counts less
 _NARROWER = 10.0  # what is tolerated, from round to round
-_FIXED = 1e8
+_WIDEST = 1e6  # at first; a pair further off than that, some metres, pulls no harder for it
+_HELD = 6  # unknowns: the first pose stays
+_TRIALS = 4  # of one step, each with more damping
+_DAMPED_LEAST, _DAMPED_MORE, _DAMPED_LESS = 1e-4, 30.0, 10.0
+_ROUNDING = 1e-9  # of a cost
+_FARTHEST_TURN_RAD = 0.5  # in one step
 _SMALL_RAD = 1e-4  # below, 1 - cos loses its digits
 
 
@@ -70,7 +77,8 @@ def solve(
     edges : sequence of Edge
         Pairs. One that the others contradict counts less (Geman and McClure's weights). At
         first all are tolerated, then less and less (graduated non-convexity, Yang et al., RA-L
-        2020), so that a true loop far from the present poses can pull them.
+        2020), so that a true loop far from the present poses can pull them. How much is bounded:
+        else a pair that is off by kilometres keeps its weight until the rounds are over.
     calibration : Calibration
         Start.
     known : Known
@@ -79,32 +87,165 @@ def solve(
         Noise.
 
     """
-    world = np.array(poses)
-    vector = calibration.vector
-    pairs = _Pairs.of(edges)
-    chain = _neighbours(world)
-    sigma = np.repeat([config.odometry_m, config.odometry_rad], 3)
-    chain_information = np.broadcast_to(np.diag(sigma**-2), (len(chain.one), 6, 6))
-    sure = np.append(np.full(BENDS, config.bend_sigma), known.readout_sigma_s) ** -2
-    wide = np.inf
+    problem = _Problem.of(poses, edges, known, config)
+    state = _State(problem.pairs, problem.chain, np.array(poses), calibration.vector)
+    wide, damping = _WIDEST * _NARROWER, 0.0
     for _ in range(_ROUNDS):
-        system = _System(len(world))
-        xi = _apart(world, pairs)
-        error = _errors(pairs, xi, vector)
+        error = state.errors
         wide = max(min(wide / _NARROWER, float(error.max(initial=1.0))), 1.0)
-        system.add(world, pairs, xi, vector, 1 / (1 + error / wide) ** 2)
-        drift = _apart(world, chain)
-        system.add_motion(world, chain, chain_information, drift)
-        system.add_known(sure, vector - known.calibration.vector)
-        step = system.solve()
-        moves = step[: 6 * len(world)].reshape(-1, 6)
-        world = _exponentials(moves) @ world
-        vector = vector + step[6 * len(world) :]
-        if wide == 1.0 and np.abs(step).max() < _SETTLED:
+        weight = 1 / (1 + error / wide) ** 2
+        system = problem.system(state, weight)
+        found, damping = problem.descend(state, system, weight, damping)
+        largest = np.inf if found is None else _largest_step(state, found)
+        state = found or state
+        if wide == 1.0 and (found is None or largest < _SETTLED):
             break
-    u, _, vt = np.linalg.svd(world[:, :3, :3])  # after many products: back onto SO(3)
-    world[:, :3, :3] = u @ vt
-    return Solution(list(world), Calibration.of_vector(np.asarray(vector)), system.last_sigma())
+    return Solution(
+        list(state.upright()), Calibration.of_vector(state.vector), system.last_sigma()
+    )
+
+
+def relative_errors(
+    poses: Sequence[Pose], edges: Sequence[Edge], calibration: Calibration, scale: float
+) -> Array:
+    """Return how far pairs are from what they want, [M], in chi-squares of `scale`."""
+    return _State.of(poses, edges, calibration).chi2 / scale
+
+
+def tolerance(poses: Sequence[Pose], edges: Sequence[Edge], calibration: Calibration) -> float:
+    """Return the chi-square beyond which a pair counts less: some medians of all pairs'."""
+    return _tolerance(_State.of(poses, edges, calibration).chi2)
+
+
+def motions_apart(before: Sequence[Pose], after: Sequence[Pose]) -> Array:
+    """Return by what the motion of each pose to the next has changed, (rho, phi), [N - 1, 6]."""
+    return _apart(np.array(after), _neighbours(np.array(before)))
+
+
+@dataclass(frozen=True)
+class _State:
+    """Where everything is, and what pairs say to that."""
+
+    pairs: _Pairs
+    chain: _Pairs
+    """Neighbours in time, whose motion is roughly known."""
+    world: Array
+    """[N, 4, 4]"""
+    vector: Array
+    """[6] of the calibration"""
+
+    @classmethod
+    def of(cls, poses: Sequence[Pose], edges: Sequence[Edge], calibration: Calibration) -> _State:
+        """Take poses for whose chain nobody asks."""
+        world = np.array(poses)
+        return cls(_Pairs.of(edges), _neighbours(world), world, calibration.vector)
+
+    @cached_property
+    def away(self) -> Array:
+        """Unknowns of each pair from where it was linearised, [M, 12]."""
+        away = self.vector - self.pairs.calibration
+        return np.concatenate([_apart(self.world, self.pairs), away], axis=1)
+
+    @cached_property
+    def drift(self) -> Array:
+        """How neighbours' motions have changed, [N - 1, 6]."""
+        return _apart(self.world, self.chain)
+
+    @property
+    def chi2(self) -> Array:
+        """Squared distance of each pair from the motion that it wants, in sigma, [M]."""
+        wanted, by_calibration = self.pairs.optimum
+        y = self.away
+        error = (y[:, :6] + wanted)[:, :, None] + by_calibration @ y[:, 6:, None]
+        return np.asarray((error * (self.pairs.regular @ error)).sum(axis=(1, 2)))
+
+    @property
+    def errors(self) -> Array:
+        """How far each pair is from what it wants, over what is usual among pairs, [M]."""
+        chi2 = self.chi2
+        return chi2 / _tolerance(chi2)
+
+    def moved(self, step: Array) -> _State:
+        """Return the state after a step of all unknowns, [6 N + 6]."""
+        size = 6 * len(self.world)
+        world = _exponentials(step[:size].reshape(-1, 6)) @ self.world
+        return replace(self, world=world, vector=self.vector + step[size:])
+
+    def upright(self) -> Array:
+        """Return the poses with their rotations, after many products, back on SO(3)."""
+        u, _, vt = np.linalg.svd(self.world[:, :3, :3])
+        world = self.world.copy()
+        world[:, :3, :3] = u @ vt
+        return world
+
+
+def _largest_step(one: _State, other: _State) -> float:
+    poses = np.abs(other.world - one.world).max()
+    return float(max(poses, np.abs(other.vector - one.vector).max()))
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """What is to be minimised."""
+
+    pairs: _Pairs
+    chain: _Pairs
+    """Neighbours in time, whose motion is roughly known."""
+    sure: Array
+    """[6] information of what is known of the calibration"""
+    known: Array
+    """[6]"""
+
+    @classmethod
+    def of(
+        cls, poses: Sequence[Pose], edges: Sequence[Edge], known: Known, config: BundleConfig
+    ) -> _Problem:
+        sigma = np.repeat([config.odometry_m, config.odometry_rad], 3)
+        chain = _neighbours(np.array(poses), np.diag(sigma**-2))
+        sure = np.append(np.full(BENDS, config.bend_sigma), known.readout_sigma_s) ** -2
+        return cls(_Pairs.of(edges), chain, sure, known.calibration.vector)
+
+    def system(self, state: _State, weight: Array) -> _System:
+        """Linearise."""
+        system = _System(len(state.world))
+        system.add(state, weight)
+        system.add_motion(state)
+        system.add_known(self.sure, state.vector - self.known)
+        return system
+
+    def cost(self, state: _State, weight: Array) -> float:
+        """Return the weighted quadratics at a state."""
+        pull = self.pairs.gradient + 0.5 * _times(self.pairs, state.away)
+        own = (state.away * pull).sum(axis=1)
+        chain = 0.5 * np.sum(state.drift * _times(self.chain, state.drift))
+        known = 0.5 * np.sum(self.sure * (state.vector - self.known) ** 2)
+        return float(weight @ own + chain + known)
+
+    def descend(
+        self, state: _State, system: _System, weight: Array, damping: float
+    ) -> tuple[_State | None, float]:
+        """
+        Step to where the cost is lower, with as little damping as that takes.
+
+        Weights that fall with the error majorise the robust cost: what lowers the one lowers the
+        other. Returns None where no step is found, and the damping to begin with next time.
+        """
+        cost = self.cost(state, weight)
+        most = cost + _ROUNDING * max(abs(cost), 1.0)
+        for _ in range(_TRIALS):
+            step = system.solve(damping)
+            if step is not None:
+                found = state.moved(_bounded(step))
+                if self.cost(found, weight) <= most:
+                    return found, damping / _DAMPED_LESS if damping > _DAMPED_LEAST else 0.0
+            damping = max(_DAMPED_LEAST, _DAMPED_MORE * damping)
+        return None, damping
+
+
+def _bounded(step: Array) -> Array:
+    """Shorten a step that turns too far for a linearisation to hold."""
+    turn = np.abs(step[:-SIZE].reshape(-1, 6)[:, 3:]).max()
+    return np.asarray(step * min(1.0, _FARTHEST_TURN_RAD / max(turn, 1e-12)))
 
 
 @dataclass(frozen=True)
@@ -124,6 +265,7 @@ class _Pairs:
 
     @classmethod
     def of(cls, edges: Sequence[Edge]) -> _Pairs:
+        """Gather factors."""
         factors = [edge.factor for edge in edges]
         size = 6 + SIZE
         return cls(
@@ -135,78 +277,92 @@ class _Pairs:
             np.array([f.calibration.vector for f in factors]).reshape(-1, SIZE),
         )
 
+    @cached_property
+    def regular(self) -> Array:
+        """Information of the motions, never quite singular, [M, 6, 6]."""
+        return np.asarray(self.information[:, :6, :6] + 1e-3 * np.eye(6))
 
-def _neighbours(world: Array) -> _Pairs:
+    @cached_property
+    def optimum(self) -> tuple[Array, Array]:
+        """What a pair wants of -xi, [M, 6], and how that changes with the calibration."""
+        right = np.concatenate([self.gradient[:, :6, None], self.information[:, :6, 6:]], axis=2)
+        wanted = np.linalg.solve(self.regular, right)
+        return wanted[:, :, 0], wanted[:, :, 1:]
+
+
+def _neighbours(world: Array, information: Array | None = None) -> _Pairs:
     """Return the present motions between keyframes that follow each other."""
     count = len(world) - 1
     one = np.arange(count)
     T = _inverses(world[1:]) @ world[:-1]
-    nothing = np.zeros((count, 0))
-    return _Pairs(one, one + 1, T, nothing, nothing, nothing)
+    each = np.broadcast_to(np.zeros((6, 6)) if information is None else information, (count, 6, 6))
+    return _Pairs(one, one + 1, T, each, np.zeros((count, 6)), np.zeros((count, SIZE)))
 
 
 def _apart(world: Array, pairs: _Pairs) -> Array:
-    """Return xi of `T_other_one = exp(xi) @ T_linearised` now, [M, 6]; they are small."""
+    """Return xi of `T_other_one = exp(xi) @ T_linearised` now, [M, 6]."""
     now = _inverses(world[pairs.other]) @ world[pairs.one]
     change = now @ _inverses(pairs.T_other_one)
     phi = Rotation.from_matrix(change[:, :3, :3]).as_rotvec().reshape(-1, 3)
     rho = change[:, :3, 3]
-    second = np.cross(phi, np.cross(phi, rho)) / 12
+    half = np.maximum(0.5 * np.linalg.norm(phi, axis=1, keepdims=True), _SMALL_RAD)
+    share = (1 - half / np.tan(half)) / (2 * half) ** 2  # 1/12 where the turn is small
+    second = share * np.cross(phi, np.cross(phi, rho))
     return np.concatenate([rho - 0.5 * np.cross(phi, rho) + second, phi], axis=1)
 
 
-def _errors(pairs: _Pairs, xi: Array, vector: Array) -> Array:
-    """Return how far each pair is from what it wants, over what is usual among pairs, [M]."""
-    if not len(xi):
-        return np.zeros(0)
-    pose = pairs.information[:, :6, :6] + 1e-3 * np.eye(6)
-    away = vector - pairs.calibration
-    pull = pairs.gradient[:, :6] + np.einsum('mij,mj->mi', pairs.information[:, :6, 6:], away)
-    error = xi + np.linalg.solve(pose, pull[:, :, None])[:, :, 0]
-    chi2 = np.einsum('mi,mij,mj->m', error, pose, error)
-    scale = _TOLERANCE * max(float(np.median(chi2)), 6.0)
-    return np.asarray(chi2 / scale)
+def _times(pairs: _Pairs, y: Array) -> Array:
+    """Return information times unknowns."""
+    return np.asarray(np.matmul(pairs.information, y[:, :, None])[:, :, 0])
+
+
+def _tolerance(chi2: Array) -> float:
+    usual = float(np.median(chi2)) if len(chi2) else 0.0
+    return _TOLERANCE * max(usual, 6.0)
 
 
 class _System:
     """Normal equations of all poses, perturbed from the left, and the calibration."""
 
     def __init__(self, count: int) -> None:
-        self._count = count
-        self._blocks = np.zeros((count, count, 6, 6))
-        self._mixed = np.zeros((count, 6, SIZE))
-        self._common = np.zeros((SIZE, SIZE))
-        self._right = np.zeros((count, 6))
-        self._right_common = np.zeros(SIZE)
+        size = 6 * count
+        self._matrix = np.zeros((size + SIZE, size + SIZE))
+        # They share its memory.
+        self._blocks = self._matrix[:size, :size].reshape(count, 6, count, 6).swapaxes(1, 2)
+        self._mixed = self._matrix[:size, size:].reshape(count, 6, SIZE)
+        self._common = self._matrix[size:, size:]
+        self._right = np.zeros(size + SIZE)
+        self._right_poses = self._right[:size].reshape(count, 6)
+        self._right_common = self._right[size:]
+        self._factors: dict[float, tuple[Array, bool]] = {}  # by damping
 
-    def add(self, world: Array, pairs: _Pairs, xi: Array, vector: Array, weight: Array) -> None:
+    def add(self, state: _State, weight: Array) -> None:
         """Add the quadratics of pairs."""
+        pairs, y = state.pairs, state.away
         information = weight[:, None, None] * pairs.information
-        y = np.concatenate([xi, vector - pairs.calibration], axis=1)
-        pull = weight[:, None] * pairs.gradient + np.einsum('mij,mj->mi', information, y)
-        adjoint = _adjoints(_inverses(world[pairs.other]))
-        self._add_blocks(pairs, adjoint, information[:, :6, :6], pull[:, :6])
-        mixed = np.swapaxes(adjoint, 1, 2) @ information[:, :6, 6:]
+        pull = weight[:, None] * (pairs.gradient + _times(pairs, y))
+        slope = _slopes(pairs, state.world, y[:, :6])
+        self._add_blocks(pairs, slope, information[:, :6, :6], pull[:, :6])
+        mixed = np.swapaxes(slope, 1, 2) @ information[:, :6, 6:]
         np.add.at(self._mixed, pairs.one, mixed)
         np.add.at(self._mixed, pairs.other, -mixed)
         self._common += information[:, 6:, 6:].sum(axis=0)
         self._right_common += pull[:, 6:].sum(axis=0)
 
-    def add_motion(self, world: Array, pairs: _Pairs, information: Array, xi: Array) -> None:
+    def add_motion(self, state: _State) -> None:
         """Add what is known of motions whatever the calibration is."""
-        adjoint = _adjoints(_inverses(world[pairs.other]))
-        pull = np.einsum('mij,mj->mi', information, xi)
-        self._add_blocks(pairs, adjoint, information, pull)
+        chain = state.chain
+        slope = _slopes(chain, state.world, state.drift)
+        self._add_blocks(chain, slope, chain.information, _times(chain, state.drift))
 
     def add_known(self, information: Array, vector: Array) -> None:
-        """Add how far the calibration is from what is known of it; hold the first pose."""
+        """Add how far the calibration is from what is known of it."""
         self._common += np.diag(information)
         self._right_common += information * vector
-        self._blocks[0, 0] += _FIXED * np.eye(6)
 
-    def _add_blocks(self, pairs: _Pairs, adjoint: Array, information: Array, pull: Array) -> None:
-        back = np.swapaxes(adjoint, 1, 2)
-        block = back @ information @ adjoint
+    def _add_blocks(self, pairs: _Pairs, slope: Array, information: Array, pull: Array) -> None:
+        back = np.swapaxes(slope, 1, 2)
+        block = back @ information @ slope
         for a, b, sign in (
             (pairs.one, pairs.one, 1),
             (pairs.other, pairs.other, 1),
@@ -215,29 +371,48 @@ class _System:
         ):
             np.add.at(self._blocks, (a, b), sign * block)
         right = np.einsum('mij,mj->mi', back, pull)
-        np.add.at(self._right, pairs.one, right)
-        np.add.at(self._right, pairs.other, -right)
+        np.add.at(self._right_poses, pairs.one, right)
+        np.add.at(self._right_poses, pairs.other, -right)
 
-    def solve(self) -> Array:
-        """Return the step of all unknowns, [6 N + 6]."""
-        right = np.concatenate([self._right.ravel(), self._right_common])
-        return np.asarray(-cho_solve(self._factor(), right))
+    def solve(self, damping: float) -> Array | None:
+        """Return Marquardt's step of all unknowns, [6 N + 6], or None where there is none."""
+        try:
+            step = -cho_solve(self._factor(damping), self._right[_HELD:])
+        except (LinAlgError, ValueError):  # not positive, or not finite
+            return None
+        return np.concatenate([np.zeros(_HELD), step])
 
     def last_sigma(self) -> float:
-        """Return the standard deviation of the last unknown."""
-        unit = np.zeros(6 * self._count + SIZE)
+        """Return the standard deviation of the last unknown; infinite where it is not known."""
+        unit = np.zeros(len(self._right) - _HELD)
         unit[-1] = 1
-        return float(np.sqrt(cho_solve(self._factor(), unit)[-1]))
+        try:
+            return float(np.sqrt(cho_solve(self._factor(0.0), unit)[-1]))
+        except (LinAlgError, ValueError):
+            return np.inf
 
-    def _factor(self) -> tuple[Array, bool]:
-        size = 6 * self._count
-        matrix = np.empty((size + SIZE, size + SIZE))
-        matrix[:size, :size] = self._blocks.transpose(0, 2, 1, 3).reshape(size, size)
-        matrix[:size, size:] = self._mixed.reshape(size, SIZE)
-        matrix[size:, :size] = matrix[:size, size:].T
-        matrix[size:, size:] = self._common
-        triangle, is_lower = cho_factor(matrix)
-        return np.asarray(triangle), bool(is_lower)
+    def _factor(self, damping: float) -> tuple[Array, bool]:
+        if damping not in self._factors:
+            matrix = self._matrix[_HELD:, _HELD:].copy()  # the upper triangle is what counts
+            matrix[np.diag_indices_from(matrix)] *= 1 + damping
+            triangle, is_lower = cho_factor(matrix.T, lower=True, overwrite_a=True)
+            self._factors[damping] = np.asarray(triangle), bool(is_lower)
+        return self._factors[damping]
+
+
+def _slopes(pairs: _Pairs, world: Array, xi: Array) -> Array:
+    """Return the derivatives of xi by a move of `one`, [M, 6, 6]; by `other` their negatives."""
+    adjoint = _adjoints(_inverses(world[pairs.other]))
+    turning = np.zeros((len(xi), 6, 6))
+    turning[:, :3, :3] = turning[:, 3:, 3:] = _hats(xi[:, 3:])
+    turning[:, :3, 3:] = _hats(xi[:, :3])
+    # The inverse of the left Jacobian to second order.
+    return np.asarray(adjoint - turning @ (0.5 * adjoint - turning @ adjoint / 12))
+
+
+def _hats(vectors: Array) -> Array:
+    """Return the skew-symmetric matrices of vectors, [M, 3, 3]."""
+    return np.cross(vectors[:, None, :], np.eye(3)).swapaxes(1, 2)
 
 
 def _exponentials(xi: Array) -> Array:

@@ -66,6 +66,16 @@ class Adjuster:
             self._run += 1
             self._poses, self._waiting, self._adjusted = {}, [], set()
 
+    @property
+    def refused_in_row(self) -> int:
+        """How many corrections in a row could not be believed."""
+        return self._back_end.refused_in_row
+
+    @property
+    def refusals(self) -> int:
+        """How many could not, since the last reset."""
+        return self._back_end.refusals
+
     def reset(self) -> None:
         """Have the back end forget all keyframes."""
         with self._busy:

@@ -40,6 +40,7 @@ class Health:
         self._name = name
         self._timings_ms: dict[str, deque[float]] = {}
         self._problems: dict[str, str] = {}
+        self._failures: set[str] = set()  # of the problems
         self._logged_s: dict[str, float] = {}
         self._publisher = node.create_publisher(
             DiagnosticArray, topics.DIAGNOSTICS, topics.RELIABLE
@@ -65,6 +66,11 @@ class Health:
         if text:
             self.warn(text)
 
+    def set_failure(self, key: str, text: str) -> None:
+        """Like `set_problem`, for what the node cannot do its work with: an ERROR, no WARN."""
+        self.set_problem(key, text)
+        (self._failures.add if text else self._failures.discard)(key)
+
     def mark(self, key: str, text: str) -> None:
         """Like `set_problem`, without the log."""
         if text:
@@ -88,8 +94,9 @@ class Health:
 
     def publish(self) -> None:
         """Send the status now."""
+        level = DiagnosticStatus.WARN if self._problems else DiagnosticStatus.OK
         status = DiagnosticStatus(
-            level=DiagnosticStatus.WARN if self._problems else DiagnosticStatus.OK,
+            level=DiagnosticStatus.ERROR if self._failures else level,
             name=f'bdgs_ros: {self._name}',
             message='; '.join(self._problems.values()) or 'ok',
             hardware_id=self._node.get_fully_qualified_name(),

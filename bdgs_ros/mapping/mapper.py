@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -51,6 +52,8 @@ from bdgs_ros.mapping.vignette import Photo, Vignette
 Mask = NDArray[np.bool_]
 Answer = Callable[[ModelView], None]
 
+_log = logging.getLogger(__name__)
+
 _PHOTOS = 4  # so many earlier keyframes are compared with
 _MIN_BLOB_SHARE = 0.002  # of the image; smaller things in front of the map are noise
 
@@ -93,6 +96,8 @@ class Mapper:
         self.history = History()
         self.readout_s: float | None = None
         """What is known of the camera's rolling shutter; told to tracking with every view."""
+        self.refused = 0
+        """How many corrections were none that can be."""
         self.vignette = Vignette()
         self.depth_bend = DepthBend()
         self._photos: list[Photo] = []
@@ -332,9 +337,16 @@ class Mapper:
         ----------
         transforms : mapping of int to ndarray, shape (4, 4)
             `T_new_old` in world by stamp (ns), also of keyframes whose images are forgotten;
-            what is not named, or unknown, stays.
+            what is not named, or unknown, stays. All stays if one of them is no motion, or moves
+            a keyframe further than `se3.FARTHEST_CORRECTION_M`.
 
         """
+        old = {s: pose for s, pose in self.keyframe_poses().items() if s in transforms}
+        new = [transforms[s] @ pose for s, pose in old.items()]
+        if not se3.is_correction(list(old.values()), new):
+            self.refused += 1
+            _log.warning('a correction was refused (%d so far)', self.refused)
+            return
         brought = {self._index_of[s]: T for s, T in transforms.items() if s in self._index_of}
         self.map.deform(brought)
         self.history.refresh(self.keyframes)

@@ -53,6 +53,8 @@ _MAX_LABEL_AGE_NS = 500_000_000
 _POSES_KEPT = 1000
 _KEYFRAMES_BEHIND = 2
 """That may wait for the back end: an older one is none to it, its frames go with another."""
+_REFUSALS_TOLD = 3
+"""Corrections in a row: one or two are of a keyframe or two that show little."""
 
 
 class MappingNode(GraphNode):
@@ -174,10 +176,20 @@ class MappingNode(GraphNode):
         else:
             with self._health.timed('back_end'):
                 adjustment = self._back_end.adjust(keyframe, self._tracked_until(stamp_ns))
+            self._tell_refusals()
             if adjustment is not None:
                 self._worker.put(partial(self._map, keyframe, adjustment))
             self._health.counts['keyframes_dropped'] = self._worker.dropped
             self._health.counts['keyframes_passed_over'] = self._adjusting.dropped
+
+    def _tell_refusals(self) -> None:
+        """Say that drift stays, as long as nothing that the back end finds can be believed."""
+        self._health.counts['corrections_refused'] = self._back_end.refusals
+        count = self._back_end.refused_in_row
+        told = (
+            'keyframes contradict each other, and drift stays: show what was seen before, or reset'
+        )
+        self._health.set_failure('back_end', told if count >= _REFUSALS_TOLD else '')
 
     def _answer_nothing(self, stamp_ns: int) -> None:
         """Tell tracking, which waits in lockstep, not to."""

@@ -67,6 +67,8 @@ class CameraTracker:
         self._motion = MotionPredictor(config.motion)
         self._movers = MoverMask(config.movers)
         self._readout_s = config.readout_s  # of the camera: outlives a reset
+        self.refused = 0
+        """How often mapping said what cannot be."""
         self._choice = KeyframeChoice(config.keyframe)
         self._loss = LossTest(config.loss)
         self._places = Places(config.places, config.features)
@@ -112,8 +114,9 @@ class CameraTracker:
         Take the static map as rendered at a keyframe, or None where there is no map.
 
         Mapping may have moved the keyframe a little; all that was tracked since moves with it.
+        A view from where the keyframe cannot be is not taken.
         """
-        if view is None:
+        if view is None or not self._may_be({view.stamp_ns: view.T_world_camera}):
             return
         self._follow(view)
         if view.readout_s is not None:
@@ -142,10 +145,12 @@ class CameraTracker:
         Parameters
         ----------
         poses : mapping of int to ndarray, shape (4, 4)
-            `T_world_camera` by stamp (ns). Newer keyframes move with the newest of them.
+            `T_world_camera` by stamp (ns). Newer keyframes move with the newest of them. None is
+            taken if one is no motion, or moves what was tracked lately further than
+            `se3.FARTHEST_CORRECTION_M`.
 
         """
-        if not poses:
+        if not poses or not self._may_be(poses):
             return
         waiting = [stamp_ns for stamp_ns in poses if stamp_ns in self._tracked]
         if waiting:
@@ -159,6 +164,18 @@ class CameraTracker:
             self._model = replace(self._model, T_world_camera=known[self._model.stamp_ns])
         self._places.put(known)
         self._move_present(known)
+
+    def _may_be(self, poses: Mapping[int, Pose]) -> bool:
+        """Return whether keyframes may be there; count and say where not."""
+        known = dict(self._tracked)
+        if self._keyframe is not None:
+            known[self._keyframe.stamp_ns] = self._keyframe.T_world_camera
+        old = [known.get(stamp_ns, pose) for stamp_ns, pose in poses.items()]
+        if se3.is_correction(old, list(poses.values())):
+            return True
+        self.refused += 1
+        _log.warning('mapping moved keyframes where they cannot be (%d so far)', self.refused)
+        return False
 
     def _move_present(self, poses: Mapping[int, Pose]) -> None:
         """Move the present with the keyframe that it is relative to."""

@@ -347,6 +347,27 @@ def test_keyframes_move_before_their_view_comes_and_not_twice(recording: tuple) 
     assert move is None or np.allclose(move, np.eye(4), atol=1e-9)
 
 
+@pytest.mark.parametrize('by', [np.nan, 1e7, 1.0])
+def test_what_mapping_cannot_mean_is_not_followed(recording: tuple, by: float) -> None:
+    frames, _ = recording
+    told, plain = CameraTracker(CONFIG), CameraTracker(CONFIG)
+    for frame in frames[:4]:
+        told.process(frame)
+        plain.process(frame)
+    new = np.eye(4)
+    if by == 1.0:
+        new[0, 0] = -1.0  # a mirror
+    new[0, 3] = by
+    still = np.zeros(CAMERA.shape, np.uint8)
+    view = ModelView(frames[0].stamp_ns, new, CAMERA, frames[0].color, frames[0].depth_m, still)
+    told.note_keyframes({frames[0].stamp_ns: new})
+    told.set_model(view)
+    assert told.refused == 2
+    assert told.take_move() is None
+    one, other = told.process(frames[4]), plain.process(frames[4])
+    np.testing.assert_array_equal(one.T_world_camera, other.T_world_camera)
+
+
 def test_places_go_where_mapping_has_their_keyframes(recording: tuple) -> None:
     """A loop is closed: what the camera will be recognised at has moved."""
     frames, _ = recording

@@ -163,6 +163,18 @@ def test_corrected_poses_take_the_map_along() -> None:
     np.testing.assert_allclose(again, seen, atol=5e-3)
 
 
+def test_a_correction_that_cannot_be_moves_no_map() -> None:
+    mapper = Mapper(CONFIG.mapping, CONFIG.belief)
+    T = poses(1)[0]
+    mapper.process(Keyframe(wall(0, T), T, no_prior()))
+    means = mapper.map.means.copy()
+    for bad in (np.full((4, 4), np.nan), 2 * np.eye(4), se3.exp(np.array([1e7, 0, 0, 0, 0, 0]))):
+        mapper.correct_poses({0: bad})
+    assert mapper.refused == 3
+    np.testing.assert_array_equal(mapper.map.means, means)
+    np.testing.assert_array_equal(mapper.keyframe_poses()[0], T)
+
+
 def test_the_map_keeps_to_its_budget() -> None:
     config = with_values(CONFIG, {'mapping.prune.max_gaussians': 1500})
     mapper = Mapper(config.mapping, config.belief)

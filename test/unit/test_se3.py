@@ -66,3 +66,20 @@ def test_view_distances_join_way_and_turn() -> None:
     assert np.all(np.isinf(np.diag(distances)))
     assert np.allclose(distances, distances.T)
     assert np.allclose(distances[0, 1:], [5.0, 1.0])
+
+
+def test_what_is_stretched_mirrored_or_no_number_is_no_rigid_motion() -> None:
+    T = np.array([se3.exp(np.array([1e3, -2.0, 3.0, 0.5, 2.0, -1.0])), np.eye(4)])
+    assert se3.are_rigid(T) and se3.are_rigid(T[0])
+    for diagonal in ([1.01, 1, 1, 1], [-1, 1, 1, 1], [1, 1, 1, 2], [np.nan, 1, 1, 1]):
+        assert not se3.are_rigid(np.array([T[0], np.diag(diagonal)]))
+
+
+def test_a_pose_may_be_corrected_by_some_metres_and_to_a_motion() -> None:
+    old = [np.eye(4), se3.exp(np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]))]
+    for x, expected in ((0.0, True), (19.0, True), (21.0, False), (np.nan, False)):
+        T = np.eye(4)
+        T[0, 3] = x
+        assert se3.is_correction(old, [old[0], T @ old[1]]) == expected
+    assert se3.is_correction([], [])
+    assert not se3.is_correction(old, [old[0], 1.1 * old[1]])
