@@ -60,6 +60,18 @@ def go_first(priority: int) -> str:
     return f'real-time scheduling: SCHED_RR, priority {priority}'
 
 
+def may_go_first(priority: int) -> bool:
+    """Return whether the system would grant a real-time priority; nothing stays changed."""
+    if not priority or not sys.platform.startswith('linux') or processors() < 2:
+        return False
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(priority))
+    except OSError:
+        return False
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    return True
+
+
 def _bound_run_time() -> None:
     _, hard = resource.getrlimit(resource.RLIMIT_RTTIME)
     soft = _LONGEST_RUN_US if hard == resource.RLIM_INFINITY else min(_LONGEST_RUN_US, hard)

@@ -22,9 +22,8 @@ _FORWARDED_WITH_VALUE = ('--log-level', '--log-config-file', '--log-file-name', 
 _REMAPS = ('-r', '--remap')
 # The terminal's ctrl-C reaches the parent alone, which passes it on. Not by a session for each:
 # Linux shares the processor evenly between sessions (autogroup), whatever their nice values are.
-_APART: dict[str, Any] = (
-    {'process_group': 0} if sys.version_info >= (3, 11) else {'start_new_session': True}
-)
+_OWN_SESSION: dict[str, Any] = {'start_new_session': True}
+_APART: dict[str, Any] = {'process_group': 0} if sys.version_info >= (3, 11) else _OWN_SESSION
 
 
 def forwarded_arguments(arguments: Sequence[str]) -> list[str]:
@@ -79,6 +78,8 @@ class Children:
     """
 
     ros_arguments: list[str]
+    own_session: frozenset[str] = frozenset()
+    """Nodes with a share of the processor of their own, whoever else there is."""
     children: dict[str, Child] = field(default_factory=dict)
     _folder: tempfile.TemporaryDirectory[str] = field(
         default_factory=lambda: tempfile.TemporaryDirectory(prefix='bdgs_ros-')
@@ -96,7 +97,8 @@ class Children:
         command = [sys.executable, '-m', f'bdgs_ros.nodes.{name}', '--ros-args']
         command += ['--params-file', str(file), *self.ros_arguments]
         environment = {**os.environ, PARENT_VARIABLE: str(os.getpid())}
-        child.process = subprocess.Popen(command, env=environment, **_APART)
+        apart = _OWN_SESSION if name in self.own_session else _APART
+        child.process = subprocess.Popen(command, env=environment, **apart)
 
     def ended(self) -> list[tuple[Child, int]]:
         """Return the children that have ended since the last call, with their exit status."""

@@ -15,8 +15,9 @@ from rclpy.clock_type import ClockType
 from std_srvs.srv import Trigger
 
 from bdgs_ros.bridge import parameters, topics
-from bdgs_ros.bridge.node_config import NODE_CONFIGS, SlamConfig
+from bdgs_ros.bridge.node_config import NODE_CONFIGS, SlamConfig, TrackingNodeConfig
 from bdgs_ros.bridge.observer import GraphObserver
+from bdgs_ros.bridge.priority import may_go_first
 from bdgs_ros.bridge.processes import Child, Children, forwarded_arguments
 from bdgs_ros.bridge.runner import REFUSED, GraphNode, run
 from bdgs_ros.core.config import BdgsConfig, specs, with_values
@@ -48,7 +49,7 @@ class SlamNode(GraphNode):
             name: self.create_client(Trigger, name) for name in self._results_to_save()
         }
         arguments = forwarded_arguments(sys.argv)
-        self._children = Children(arguments)
+        self._children = Children(arguments, self._with_own_share())
         self._threads = InProcessNodes(arguments)
         self._replay_report = self._children.file('replay.json')
         self._start_graph()
@@ -68,6 +69,18 @@ class SlamNode(GraphNode):
             wanted = max(len(_GRAPH), int(values.get('wait_subscribers', 0)))
             own = {'wait_subscribers': wanted, 'report_file': str(self._replay_report)}
             self._children.start('replay_node', {**values, **own})
+
+    def _with_own_share(self) -> frozenset[str]:
+        """
+        Return the nodes that other processes of the machine cannot starve.
+
+        Mapping's priority is low for tracking's sake. Where tracking goes first anyway, mapping
+        has a share like that of any other program, not what the rest of the graph leaves it.
+        """
+        default = TrackingNodeConfig().realtime_priority
+        priority = int(self._values.get('realtime_priority', default))
+        goes_first = not self._config.lockstep and may_go_first(priority)
+        return frozenset({'mapping_node'} if goes_first else ())
 
     def _result_files(self) -> dict[str, str]:
         if not self._config.output:

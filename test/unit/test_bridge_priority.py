@@ -46,6 +46,17 @@ print(note, policies == [os.SCHED_RR] * 2, policies == [os.SCHED_OTHER] * 2)
 
 
 @linux
+def test_whether_it_would_be_granted_is_asked_and_nothing_changes() -> None:
+    code = """
+from bdgs_ros.bridge.priority import may_go_first
+may = may_go_first(1)
+same = os.sched_getscheduler(0) == os.SCHED_OTHER
+print(same, may == ('SCHED_RR' in go_first(1) and os.sched_getscheduler(0) == os.SCHED_RR))
+"""
+    assert run(code) == 'True True'
+
+
+@linux
 @pytest.mark.skipif((os.cpu_count() or 1) < 2, reason='one processor')
 def test_a_thread_that_never_sleeps_is_ordinary_again() -> None:
     code = """
