@@ -126,12 +126,17 @@ class BackEnd:
         if not se3.are_rigid(np.array([keyframe.T_world_camera, *poses.values()])):
             self._refuse('keyframes came with poses that are no motions')
             return {}
-        self._poses = {known: poses.get(known, pose) for known, pose in self._poses.items()}
+        # What is off SO(3) would be off twice as far after each correction.
+        self._poses = {
+            known: se3.orthonormalise(poses.get(known, pose))
+            for known, pose in self._poses.items()
+        }
         self.observe(stamp_ns, keyframe.T_world_camera)
         self._follow_velocity()
         view = View.of(keyframe, self._velocity(stamp_ns))
         corners = find_corners(view, self._config.bundle)
-        self._poses[stamp_ns], self._views[stamp_ns] = keyframe.T_world_camera, view
+        self._poses[stamp_ns] = se3.orthonormalise(keyframe.T_world_camera)
+        self._views[stamp_ns] = view
         for other in self._partners(corners):
             self._join(corners, other, self._relative(other, stamp_ns))
         if self._config.loop.enabled:

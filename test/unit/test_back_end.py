@@ -96,6 +96,16 @@ def test_drift_between_keyframes_is_taken_out() -> None:
     assert errors_m(on, xs).max() < 0.02
 
 
+def test_corrections_one_after_the_other_stay_rigid_motions() -> None:
+    """At eb10d7b what poses were off SO(3) doubled with each; after 54 the graph was singular."""
+    xs = [STEP_M * abs((i + 15) % 30 - 15) for i in range(60)]
+    poses = run(BackEnd(CONFIG), xs, 0.3 * DRIFT)
+    rotations = np.array([pose[:3, :3] for pose in poses.values()])
+    off = rotations @ rotations.swapaxes(1, 2) - np.eye(3)
+    assert np.abs(off).max() < 1e-12
+    assert errors_m(poses, xs).max() < 0.02
+
+
 def test_poses_that_agree_are_left_alone() -> None:
     xs = [STEP_M * i for i in range(4)]
     assert errors_m(run(BackEnd(CONFIG), xs, np.zeros(6)), xs).max() < 0.002
