@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeGuard
 
@@ -33,6 +33,8 @@ Array = NDArray[np.float64]
 _log = logging.getLogger(__name__)
 
 _RECENT = 300  # poses of frames: keyframes may come late
+_HURRIED_WINDOW = 3  # newest keyframes that a new one is joined with when the next one waits
+_UNLOOKED = 3  # keyframes whose features are found when there is time; older ones are no places
 _RENEWED = 12  # pairs condensed again at a keyframe, at most
 _OFF_RAD = 0.002  # how far the images of a pair may be bent otherwise than it was condensed with
 _OVERCONFIDENT = 3.0  # pairs share velocities, so their errors are not independent
@@ -63,11 +65,15 @@ class BackEnd:
     ----------
     config : BackEndConfig
         Sizes and noise.
+    hurried : callable
+        Asked at each keyframe whether the next one waits already; then it is joined with the
+        newest ones alone. Places that it might show are looked for later.
 
     """
 
-    def __init__(self, config: BackEndConfig) -> None:
+    def __init__(self, config: BackEndConfig, hurried: Callable[[], bool] = lambda: False) -> None:
         self._config = config
+        self._hurried = hurried
         self._known = Known(Calibration.perfect(), config.bundle.readout_sigma_s)
         self.calibration = self._known.calibration
         self._readout_sigma_s = self._known.readout_sigma_s
@@ -88,6 +94,7 @@ class BackEnd:
         self._pairs: dict[tuple[int, int], _Pair] = {}
         self._follows: dict[int, int] = {}  # keyframes that were dropped: whom they move with
         self._loop = LoopDetector(self._config.loop)
+        self._unlooked: deque[Keyframe] = deque(maxlen=_UNLOOKED)  # by the detector of loops
         self._suspected: Recognised | None = None  # by the last keyframe, and not yet believed
 
     def start_from(self, readout_s: float | None) -> None:
@@ -137,11 +144,14 @@ class BackEnd:
         corners = find_corners(view, self._config.bundle)
         self._poses[stamp_ns] = se3.orthonormalise(keyframe.T_world_camera)
         self._views[stamp_ns] = view
-        for other in self._partners(corners):
-            self._join(corners, other, self._relative(other, stamp_ns))
-        if self._config.loop.enabled:
-            self._close_loop(keyframe, corners)
-        self._renew()
+        self._unlooked.append(keyframe)
+        if self._hurried():
+            self._join_all(corners, list(self._views)[-_HURRIED_WINDOW - 1 : -1])
+        else:
+            self._join_all(corners, self._partners(corners))
+            if self._config.loop.enabled:
+                self._close_loop(corners)
+            self._renew()
         transforms = self._solve()
         self._drop_redundant()
         return transforms
@@ -192,6 +202,10 @@ class BackEnd:
         order = np.argsort(-np.array(shares), kind='stable')[: config.older]
         return window + [near[i] for i in order if shares[i] >= config.overlap]
 
+    def _join_all(self, corners: Corners, others: Sequence[int]) -> None:
+        for other in others:
+            self._join(corners, other, self._relative(other, corners.view.stamp_ns))
+
     def _join(self, corners: Corners, other: int, T_other_one: Pose) -> bool:
         """Add a pair, if the other keyframe shows enough of the corners."""
         config = self._config.bundle
@@ -216,13 +230,19 @@ class BackEnd:
             self._config.bundle,
         )
 
-    def _close_loop(self, keyframe: Keyframe, corners: Corners) -> None:
+    def _close_loop(self, corners: Corners) -> None:
         """Join a place that the present poses do not bring together with the new keyframe."""
-        stamp_ns = keyframe.frame.stamp_ns
-        self._loop.add(keyframe)
+        stamp_ns = corners.view.stamp_ns
+        for keyframe in self._unlooked:
+            self._loop.add(keyframe)
+        self._unlooked.clear()
         joined = {old for new, old in self._pairs if new == stamp_ns}
         window = list(self._views)[-self._config.bundle.window - 1 :]
-        among = [known for known in self._views if known not in joined and known not in window]
+        among = [
+            known
+            for known in self._views
+            if known not in joined and known not in window and self._loop.knows(known)
+        ]
         found = self._loop.find(stamp_ns, among) if among else None
         if self._is_believed(found) and self._join(corners, found.stamp_ns, found.T_earlier_new):
             self.loops += 1

@@ -74,6 +74,10 @@ class LoopDetector:
         """Drop a keyframe that is no longer kept."""
         self._known.pop(stamp_ns, None)
 
+    def knows(self, stamp_ns: int) -> bool:
+        """Return whether a keyframe is remembered."""
+        return stamp_ns in self._known
+
     def find(self, stamp_ns: int, among: Sequence[int]) -> Recognised | None:
         """
         Look for the place of a remembered keyframe among earlier ones.

@@ -13,7 +13,10 @@ over all keyframes (`graph`) has no landmarks and costs milliseconds.
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass, replace
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +29,10 @@ from bdgs_ros.core.config.back_end import BundleConfig
 from bdgs_ros.core.types import Pose
 
 Array = NDArray[np.float64]
+
+_kernels: Any = None
+with contextlib.suppress(ImportError):
+    _kernels = import_module('bdgs_ros._two_views')
 
 UNKNOWNS = 6 + SIZE
 _FREE = [*range(6), 6 + BENDS]  # of the unknowns, while a pair is condensed
@@ -74,6 +81,7 @@ def condense(
     readout_sigma_s: float,
     focal_px: float,
     config: BundleConfig,
+    native: bool = True,
 ) -> PairFactor:
     """
     Align two views by their shared corners, and return what that says.
@@ -95,8 +103,58 @@ def condense(
         Of the other view.
     config : BundleConfig
         Noise.
+    native : bool
+        Use the kernel where it was built; otherwise its twin in numpy.
 
     """
+    arguments = shared, T_other_one, twists, calibration, readout_sigma_s, focal_px, config
+    if native and _kernels is not None:
+        return _condense_native(*arguments)
+    return _condense_numpy(*arguments)
+
+
+def _condense_native(
+    shared: Shared,
+    T_other_one: Pose,
+    twists: tuple[Array, Array],
+    calibration: Calibration,
+    readout_sigma_s: float,
+    focal_px: float,
+    config: BundleConfig,
+) -> PairFactor:
+    assert _kernels is not None
+    T, readout_s, information, gradient, inliers = _kernels.condense(
+        shared.tangents,
+        shared.inverse_depth,
+        shared.tangents_other,
+        shared.inverse_depth_other,
+        shared.rows,
+        shared.p_static,
+        bend_functions(shared.tangents),
+        bend_functions(shared.tangents_other),
+        T_other_one,
+        *twists,
+        calibration.bend,
+        calibration.readout_s,
+        readout_sigma_s,
+        focal_px / config.pixel_sigma,
+        config.inverse_depth_sigma,
+        config.dof,
+        _ROUNDS,
+    )
+    at = replace(calibration, readout_s=readout_s)
+    return PairFactor(T, at, calibration.readout_s, twists, information, gradient, inliers)
+
+
+def _condense_numpy(
+    shared: Shared,
+    T_other_one: Pose,
+    twists: tuple[Array, Array],
+    calibration: Calibration,
+    readout_sigma_s: float,
+    focal_px: float,
+    config: BundleConfig,
+) -> PairFactor:
     T, at = np.asarray(T_other_one, np.float64), calibration
     bent = bend_functions(shared.tangents) @ calibration.bend
     inverse = shared.inverse_depth + bent

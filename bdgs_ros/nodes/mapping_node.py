@@ -70,7 +70,7 @@ class MappingNode(GraphNode):
         self._mapper = Mapper(_mapping_config(config), config.belief, self._is_hurried)
         self._live = LiveMap(self._mapper)
         self._back_end = Adjuster(
-            BackEnd(config.back_end),
+            BackEnd(config.back_end, self._sheds_pairs),
             self._mapper,
             self._publish_keyframes,
             lambda view: self._models.publish(view.stamp_ns, view),
@@ -232,6 +232,11 @@ class MappingNode(GraphNode):
         while self._tracked and self._tracked[0].stamp_ns < stamp_ns:
             found.append(self._tracked.popleft())
         return found
+
+    def _sheds_pairs(self) -> bool:
+        """Return whether the back end has no time for old pairs."""
+        behind = self._adjusting.waiting > 0 or self._shed >= Shed.PAIRS
+        return behind and not self._config.lockstep
 
     def _is_hurried(self) -> bool:
         if self._config.lockstep:

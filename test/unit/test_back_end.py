@@ -189,3 +189,28 @@ def test_a_loop_brings_the_camera_back(enabled: bool) -> None:
     error_m, loops = loop_error_m(enabled)
     assert (loops > 0) == enabled
     assert (error_m < 0.1) == enabled
+
+
+def test_in_haste_a_keyframe_is_joined_with_the_newest_alone_and_places_are_looked_for_later() -> (
+    None
+):
+    hurried = True
+    back_end = BackEnd(CONFIG, lambda: hurried)
+    poses: dict[int, np.ndarray] = {}
+
+    def take(index: int, x_m: float) -> None:
+        new = keyframe(index, x_m, texture())
+        transforms = back_end.process(new, poses)
+        poses[index * SECOND] = new.T_world_camera
+        for stamp_ns, T in transforms.items():
+            poses[stamp_ns] = T @ poses[stamp_ns]
+
+    for i in range(6):
+        take(i, i * STEP_M / 2)
+    assert {new - old for new, old in back_end._pairs} == {SECOND, 2 * SECOND, 3 * SECOND}
+    assert not any(back_end._loop.knows(i * SECOND) for i in range(6))
+    hurried = False
+    take(6, 0.3)
+    assert len([new for new, _ in back_end._pairs if new == 6 * SECOND]) == 6
+    assert back_end._loop.knows(5 * SECOND)
+    assert back_end._loop.knows(6 * SECOND)

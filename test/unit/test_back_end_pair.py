@@ -218,3 +218,27 @@ def test_a_pair_that_all_others_contradict_is_overruled() -> None:
         noisy(truth), [*good, Edge(7, 0, false)], Calibration.perfect(), UNKNOWN, CONFIG
     )
     assert worst_m(solution.poses, truth) < 0.003
+
+
+@pytest.mark.parametrize('seed', range(6))
+def test_the_kernel_agrees_with_its_twin(seed: int) -> None:
+    """With movers, missing depth, rolling shutter and bend: to the last digits."""
+    pytest.importorskip('bdgs_ros._two_views')
+    rng = np.random.default_rng(seed)
+    calibration = Calibration(rng.normal(0, 0.02, 5), 0.02 * seed / 5)
+    one, other = motions(3, seed)[1:]
+    twists = (rng.normal(0, 0.5, 6), rng.normal(0, 0.5, 6))
+    shared = Room.random(calibration, seed).share(one, other, twists)
+    shared.tangents_other[:10] += rng.normal(0, 0.2, (10, 2))
+    shared.inverse_depth_other[10:20] = 0
+    shared.p_static[20:30] = rng.uniform(0, 1, 10)
+    start = se3.exp(rng.normal(0, 0.01, 6)) @ se3.inverse(other) @ one
+    given = shared, start, twists, calibration, SIGMA_S, FOCAL, CONFIG
+    fast, slow = condense(*given), condense(*given, native=False)
+    assert np.abs(fast.T_other_one - slow.T_other_one).max() < 1e-9
+    assert abs(fast.calibration.readout_s - slow.calibration.readout_s) < 1e-9
+    scale = np.abs(slow.information).max()
+    assert np.abs(fast.information - slow.information).max() < 1e-8 * scale
+    # at the optimum the pull of the motion is what is left of large numbers
+    assert np.abs(fast.gradient - slow.gradient).max() < 1e-8 * scale
+    assert fast.inliers == slow.inliers
