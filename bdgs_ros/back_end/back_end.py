@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from bdgs_ros.back_end.calibration import Calibration, Known
 from bdgs_ros.back_end.check import objection
 from bdgs_ros.back_end.corners import Corners, Shared, View, find_corners, follow, overlap
-from bdgs_ros.back_end.graph import Edge, Solution, relative_errors, solve
+from bdgs_ros.back_end.graph import Edge, Solution, pair_errors, solve
 from bdgs_ros.back_end.loop import LoopDetector, Recognised, agree
 from bdgs_ros.back_end.pair import PairFactor, condense
 from bdgs_ros.back_end.velocity import velocity_at
@@ -318,7 +318,7 @@ class BackEnd:
                 self._pairs = {key: self._pairs[key] for key in keys}
                 self.refused_in_row = 0
                 return solution
-            error = relative_errors(before, edges, self.calibration, scale=1.0)
+            (error,) = pair_errors(edges, (before, self.calibration))
             fits = error < _FITS_AS_BADLY * error.max()
             keys = [key for key, is_kept in zip(keys, fits, strict=True) if is_kept]
             if not keys:

@@ -14,13 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bdgs_ros.back_end.calibration import Calibration, Known
-from bdgs_ros.back_end.graph import (
-    Edge,
-    Solution,
-    motions_apart,
-    relative_errors,
-    tolerance,
-)
+from bdgs_ros.back_end.graph import Edge, Solution, motions_apart, pair_errors
 from bdgs_ros.core import se3
 from bdgs_ros.core.bend import BENDS
 from bdgs_ros.core.config.back_end import BundleConfig
@@ -69,9 +63,7 @@ def objection(
         return 'its poses are no motions'
     if not _is_possible(found, known, config):
         return 'no camera has such a shutter or bend'
-    scale = min(tolerance(before, edges, calibration), tolerance(after, edges, found))
-    was = relative_errors(before, edges, calibration, scale)
-    errors = relative_errors(after, edges, found, scale)
+    was, errors = pair_errors(edges, (before, calibration), (after, found))
     # Odometry and the calibration may outvote a pair, and no more than one.
     if _cost(errors) > _cost(was) + 1:
         return 'the pairs fit worse than before'

@@ -105,16 +105,15 @@ def solve(
     )
 
 
-def relative_errors(
-    poses: Sequence[Pose], edges: Sequence[Edge], calibration: Calibration, scale: float
-) -> Array:
-    """Return how far pairs are from what they want, [M], in chi-squares of `scale`."""
-    return _State.of(poses, edges, calibration).chi2 / scale
-
-
-def tolerance(poses: Sequence[Pose], edges: Sequence[Edge], calibration: Calibration) -> float:
-    """Return the chi-square beyond which a pair counts less: some medians of all pairs'."""
-    return _tolerance(_State.of(poses, edges, calibration).chi2)
+def pair_errors(edges: Sequence[Edge], *states: tuple[Sequence[Pose], Calibration]) -> list[Array]:
+    """Return how far pairs are from what they want, [M], at each of some states; 1 is bearable."""
+    pairs = _Pairs.of(edges)
+    chi2 = []
+    for poses, calibration in states:
+        world = np.array(poses)
+        chi2.append(_State(pairs, _neighbours(world), world, calibration.vector).chi2)
+    scale = min(_tolerance(each) for each in chi2)
+    return [each / scale for each in chi2]
 
 
 def motions_apart(before: Sequence[Pose], after: Sequence[Pose]) -> Array:
@@ -133,12 +132,6 @@ class _State:
     """[N, 4, 4]"""
     vector: Array
     """[6] of the calibration"""
-
-    @classmethod
-    def of(cls, poses: Sequence[Pose], edges: Sequence[Edge], calibration: Calibration) -> _State:
-        """Take poses for whose chain nobody asks."""
-        world = np.array(poses)
-        return cls(_Pairs.of(edges), _neighbours(world), world, calibration.vector)
 
     @cached_property
     def away(self) -> Array:
