@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -179,9 +179,24 @@ class Adjustment:
         return Keyframe(frame, pose, p_dynamic)
 
 
-def adjust(back_end: BackEnd, keyframe: Keyframe, poses: Mapping[int, Pose]) -> Adjustment:
-    """Ask the back end about a keyframe newer than all others, which are at `poses` now."""
+def adjust(
+    back_end: BackEnd,
+    keyframe: Keyframe,
+    poses: Mapping[int, Pose],
+    T_placed_tracked: Pose | None = None,
+) -> Adjustment:
+    """
+    Ask the back end about a keyframe newer than all others, which are at `poses` now.
+
+    `T_placed_tracked` moves it there from the world that tracking was in, if that is another.
+    """
     stamp_ns = keyframe.frame.stamp_ns
-    transforms = back_end.process(keyframe, poses)
+    if T_placed_tracked is None:
+        transforms = back_end.process(keyframe, poses)
+    else:
+        T_world_camera = T_placed_tracked @ keyframe.T_world_camera
+        transforms = back_end.process(replace(keyframe, T_world_camera=T_world_camera), poses)
+        T_new_placed = transforms.get(stamp_ns, se3.identity())
+        transforms = {**transforms, stamp_ns: T_new_placed @ T_placed_tracked}
     sweep = back_end.sweep(stamp_ns)
     return Adjustment(stamp_ns, keyframe.T_world_camera, transforms, back_end.readout_s, sweep)

@@ -150,6 +150,7 @@ class MappingNode(GraphNode):
         if self._live.is_entered:
             T_new_old = conversions.motion_from_message(message)
             self._mapper.history.note_move(conversions.stamp_ns(message), T_new_old)
+            self._back_end.note_move(conversions.stamp_ns(message), T_new_old)
 
     def _queue_keyframe(self, message: PoseStamped) -> None:
         stamp_ns = conversions.stamp_ns(message)

@@ -41,8 +41,8 @@ class LateTracking:
     def _put(self, told: Callable[[], None]) -> None:
         self._inbox.append((self._count + self._late, told))
 
-    def step(self, motion: Pose) -> Pose:
-        """Return T_world_camera of the next keyframe."""
+    def step(self, motion: Pose) -> tuple[Pose, Pose | None]:
+        """Return T_world_camera of the next keyframe, and by what the world moved before it."""
         while self._inbox and self._inbox[0][0] <= self._count:
             self._inbox.popleft()[1]()
         before, T = self._tracker._keyframe, np.eye(4)
@@ -52,7 +52,7 @@ class LateTracking:
         self._tracker._keyframe = Reference(self._count * SECOND, T, pyramid)
         self._tracker._tracked[self._count * SECOND] = T
         self._count += 1
-        return T
+        return T, self._tracker.take_move()
 
 
 @pytest.mark.parametrize(('late', 'every'), [(0, 1), (4, 5), (8, 5), (4, 99)])
@@ -63,7 +63,9 @@ def test_late_corrections_are_made_once(late: int, every: int) -> None:
     adjuster = Adjuster(back_end, stand_in, tracking.hear_poses, tracking.hear_view, at_once=True)
     xs = [STEP_M * (10 - abs(i % 20 - 10)) for i in range(30)]
     for i, x in enumerate(xs):
-        T = tracking.step(at(x - xs[i - 1] if i else 0.0))
+        T, move = tracking.step(at(x - xs[i - 1] if i else 0.0))
+        if move is not None:
+            adjuster.note_move(i * SECOND, move)
         picture = keyframe(i, x, texture(), T)
         adjustment = adjuster.adjust(picture, [])
         assert adjustment is not None

@@ -12,7 +12,7 @@ import pytest
 from bdgs_ros.bridge.adjuster import Adjuster
 from bdgs_ros.core import se3
 from bdgs_ros.core.camera import PinholeCamera
-from bdgs_ros.core.types import Keyframe, ModelView, Pose, RgbdFrame
+from bdgs_ros.core.types import Keyframe, ModelView, Pose, RgbdFrame, StampedPose
 
 CAMERA = PinholeCamera(8, 6, 8.0, 8.0, 3.5, 2.5)
 
@@ -107,7 +107,7 @@ def test_a_view_is_shown_where_its_keyframe_is_by_now() -> None:
     heard = Heard(at_once=True)
     heard.mapper.during = lambda: heard.adjuster.adjust(a_keyframe(20, 5.0), [])
     heard.take(10, 0.0)
-    assert heard.log == [{10: 1.0}, (10, 1.0), {10: 2.0, 20: 6.0}, (10, 2.0), {10: 2.0, 20: 6.0}]
+    assert heard.log == [{10: 1.0}, (10, 1.0), {10: 2.0, 20: 7.0}, (10, 2.0), {10: 2.0, 20: 7.0}]
     assert x_of(heard.mapper.poses[10]) == 1.0  # it learns of the rest with its next keyframe
 
 
@@ -115,7 +115,34 @@ def test_a_keyframe_that_never_reaches_the_map_is_in_the_graph() -> None:
     heard = Heard(at_once=True)
     heard.adjuster.adjust(a_keyframe(10, 0.0), [])
     heard.take(20, 5.0)
-    assert {s: x_of(T) for s, T in heard.mapper.poses.items()} == {10: 2.0, 20: 6.0}
+    assert {s: x_of(T) for s, T in heard.mapper.poses.items()} == {10: 2.0, 20: 7.0}
+
+
+def test_a_keyframe_is_where_the_last_one_is_whether_tracking_has_heard_of_that_or_not() -> None:
+    """It was tracked 5 m beside the last one, which is 1 m from where it was, and both move on."""
+    late, knowing = Heard(at_once=True), Heard(at_once=True)
+    for heard in (late, knowing):
+        heard.take(10, 0.0)
+    late.take(20, 5.0)
+    knowing.adjuster.note_move(15, at(1.0))
+    knowing.take(20, 6.0)
+    for heard in (late, knowing):
+        assert {s: x_of(T) for s, T in heard.mapper.poses.items()} == {10: 2.0, 20: 7.0}
+    late.adjuster.note_move(25, at(2.0))  # of both corrections at once
+    late.take(30, 9.0)
+    assert x_of(late.mapper.poses[30]) == 2.0 + 7.0 + 1.0
+
+
+def test_frames_before_a_keyframe_are_told_in_its_world() -> None:
+    heard = Heard(at_once=True)
+    observed: list[tuple[int, float]] = []
+    back_end: Any = heard.adjuster._back_end
+    back_end.observe = lambda stamp_ns, T: observed.append((stamp_ns, x_of(T)))
+    heard.take(10, 0.0)
+    heard.adjuster.note_move(16, at(1.0))
+    frames = [StampedPose(12, at(0.2)), StampedPose(16, at(1.6))]
+    heard.adjuster.adjust(a_keyframe(20, 2.0), frames)
+    assert observed == [(12, 1.2), (16, 1.6)]
 
 
 def test_in_lockstep_nothing_is_told_before_the_view() -> None:
@@ -154,6 +181,6 @@ def test_adjusting_does_not_wait_for_the_mapper() -> None:
     mapping.start()
     assert amid.wait(5.0)
     assert heard.adjuster.adjust(a_keyframe(20, 5.0), []) is not None
-    assert heard.log[-1] == {10: 2.0, 20: 6.0}
+    assert heard.log[-1] == {10: 2.0, 20: 7.0}
     free.set()
     mapping.join()
