@@ -53,6 +53,7 @@ class MotionPredictor:
     def __init__(self, config: MotionConfig) -> None:
         self._config = config
         self._state: _State | None = None
+        self._last: tuple[_State, _State] | None = None  # a state and where it was moved to
 
     def reset(self) -> None:
         """Forget pose and velocity."""
@@ -147,6 +148,12 @@ class MotionPredictor:
         return np.diag(np.array(spread * 2))
 
     def _propagate(self, state: _State, stamp_ns: int) -> _State:
+        """Move to a stamp; a frame asks three times: to predict, for its velocity, to update."""
+        if self._last is None or self._last[0] is not state or self._last[1].stamp_ns != stamp_ns:
+            self._last = state, self._moved(state, stamp_ns)
+        return self._last[1]
+
+    def _moved(self, state: _State, stamp_ns: int) -> _State:
         """Move along the screw; the pose error turns with the camera, and noise is added."""
         if stamp_ns <= state.stamp_ns:
             raise ValueError(
