@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import resource
 import signal
 import sys
 import threading
 from pathlib import Path
+
+_log = logging.getLogger(__name__)
 
 _LONGEST_RUN_US = 1_000_000
 """A real-time thread that computes for so long without sleeping is one no longer."""
@@ -76,7 +79,16 @@ def _bound_run_time() -> None:
     _, hard = resource.getrlimit(resource.RLIMIT_RTTIME)
     soft = _LONGEST_RUN_US if hard == resource.RLIM_INFINITY else min(_LONGEST_RUN_US, hard)
     resource.setrlimit(resource.RLIMIT_RTTIME, (soft, hard))
-    signal.signal(signal.SIGXCPU, lambda *_: _schedule(os.SCHED_OTHER, 0))
+    signal.signal(signal.SIGXCPU, _be_ordinary)
+
+
+def _be_ordinary(*_: object) -> None:
+    _schedule(os.SCHED_OTHER, 0)
+    _log.warning(
+        'a thread with real-time priority computed for %.1f s without sleeping: all threads of '
+        'this process have ordinary priorities from now on',
+        _LONGEST_RUN_US * 1e-6,
+    )
 
 
 def _schedule(policy: int, priority: int) -> None:

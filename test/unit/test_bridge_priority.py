@@ -60,15 +60,20 @@ print(same, may == ('SCHED_RR' in go_first(1) and os.sched_getscheduler(0) == os
 @pytest.mark.skipif((os.cpu_count() or 1) < 2, reason='one processor')
 def test_a_thread_that_never_sleeps_is_ordinary_again() -> None:
     code = """
+import logging
+from bdgs_ros.bridge import priority
+warned = []
+priority._log.addFilter(lambda record: warned.append(record.getMessage()))
 note = go_first(1)
 end = time.monotonic() + 3
 while time.monotonic() < end and os.sched_getscheduler(0) != os.SCHED_OTHER:
     pass
-print(note, os.sched_getscheduler(0) == os.SCHED_OTHER)
+print(note, warned, os.sched_getscheduler(0) == os.SCHED_OTHER)
 """
     found = run(code)
     if _GRANTED not in found:
         pytest.skip('real-time scheduling is not granted here')
+    assert 'ordinary priorities from now on' in found
     assert found.endswith('True')
 
 
