@@ -20,8 +20,8 @@ _POSES, _LEAST_POSES = 30, 10  # that tell how late they are
 _LONGEST_PERIOD_S = 0.5  # of a camera that SLAM is done with
 _DECIDE_S = 0.5  # between two changes
 _CALM_S = 2.0  # without pressure before a step is given back
-_PRESSED = 1.5  # periods from image to pose, at the 90th percentile: too many
-_AT_EASE = 1.0  # periods: there is room
+_PRESSED, _PRESSED_S = 1.5, 0.04  # periods and s from image to pose, 90th percentile: too many
+_AT_EASE, _AT_EASE_S = 1.0, 0.03  # there is room
 _LATE = 2.0  # periods that a frame may wait while newer ones are there
 
 
@@ -99,13 +99,15 @@ class Governor:
         """Say why something must be left out; nothing where poses are in time."""
         if self._passed_over:
             return f'{self._passed_over} frames were passed over'
-        if self._late_periods() > _PRESSED:
-            late_ms = 1e3 * self._late_periods() * self.period_s
-            return f'poses come {late_ms:.0f} ms after their images'
+        if self._late_s() > max(_PRESSED * self.period_s, _PRESSED_S):
+            return f'poses come {1e3 * self._late_s():.0f} ms after their images'
         return ''
 
-    def _late_periods(self) -> float:
-        return float(np.percentile(self._ages_s, 90)) / max(self.period_s, 1e-3)
+    def _late_s(self) -> float:
+        return float(np.percentile(self._ages_s, 90))
+
+    def _is_at_ease(self) -> bool:
+        return self._late_s() < max(_AT_EASE * self.period_s, _AT_EASE_S)
 
     def _step(self, pressure: str, now_s: float) -> bool:
         """Go one step up or down; what it changes is looked at anew."""
@@ -113,7 +115,7 @@ class Governor:
         if pressure:
             self.level = Shed(min(self.level + 1, max(Shed)))
             self.reason = pressure
-        elif now_s - self._pressed_s > _CALM_S and self._late_periods() < _AT_EASE:
+        elif now_s - self._pressed_s > _CALM_S and self._is_at_ease():
             self.level = Shed(max(self.level - 1, min(Shed)))
         self._passed_over = 0
         if self.level == before:

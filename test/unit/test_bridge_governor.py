@@ -28,6 +28,14 @@ def test_nothing_is_left_out_while_poses_are_in_time() -> None:
     assert set(run(Governor(), 10.0, 20.0, 0.025)) == {Shed.NOTHING}
 
 
+def test_a_fast_camera_does_not_make_a_prompt_pose_late() -> None:
+    governor = Governor()
+    for i in range(600):
+        governor.note_arrival(i / 90)
+        governor.note_pose(i / 90, i / 90 + 0.025)
+    assert governor.level is Shed.NOTHING
+
+
 def test_late_poses_leave_out_one_thing_after_the_other_and_get_it_back() -> None:
     governor = Governor()
     levels = run(governor, 10.0, 5.0, 0.08)
