@@ -24,10 +24,13 @@ class LoadWatch:
         It publishes `bdgs/shed`.
     health : Health
         Shows what is left out, and why.
+    enabled : bool
+        In lockstep nothing is late: no frame is passed over, and nothing is left out.
 
     """
 
-    def __init__(self, node: Node, health: Health) -> None:
+    def __init__(self, node: Node, health: Health, *, enabled: bool) -> None:
+        self._enabled = enabled
         self._governor = Governor()
         self._health = health
         self._publisher = node.create_publisher(UInt8, topics.SHED, topics.LATCHED)
@@ -43,7 +46,7 @@ class LoadWatch:
 
     def is_late(self, raw: RawFrame) -> bool:
         """Return whether a newer frame is worth more than this one."""
-        return self._governor.is_late(raw.received_s, time.monotonic())
+        return self._enabled and self._governor.is_late(raw.received_s, time.monotonic())
 
     def note_passed_over(self) -> None:
         """Note that a frame was passed over."""
@@ -51,7 +54,7 @@ class LoadWatch:
 
     def note_pose(self, raw: RawFrame) -> None:
         """Note that a frame is done; say so if more or less is to be left out now."""
-        if not self._governor.note_pose(raw.received_s, time.monotonic()):
+        if not (self._enabled and self._governor.note_pose(raw.received_s, time.monotonic())):
             return
         level = self._governor.level
         self._publisher.publish(UInt8(data=level))

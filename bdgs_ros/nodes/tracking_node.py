@@ -52,7 +52,7 @@ class TrackingNode(GraphNode):
         self._reset_event = self.create_publisher(Empty, topics.RESET_EVENT, topics.RELIABLE)
         self._feedback = Feedback(self, config, self._health)
         self._decoder = FrameDecoder.of(self)
-        self._load = LoadWatch(self, self._health)
+        self._load = LoadWatch(self, self._health, enabled=not config.lockstep)
         self.realtime_priority = 0 if config.lockstep else config.realtime_priority
         self._worker: Worker[RawFrame] = Worker(
             self._on_frame,
