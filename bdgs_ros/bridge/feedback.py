@@ -30,7 +30,7 @@ _MODELS_KEPT = 4
 _KEYFRAMES_KEPT = 300
 _ASK_PERIOD_S = 1.0
 _ABSENT_S = 1.0
-_FIRST_ABSENT_S = 5.0  # the first message can be later than the discovery of its publisher
+FIRST_ABSENT_S = 5.0  # the first message can be later than the discovery of its publisher
 
 
 class Feedback:
@@ -155,7 +155,7 @@ class Feedback:
 
     def _wait(self, buffer: StampBuffer[Item], stamp_ns: int, topic: str) -> Item | None:
         """Wait for a stamp; not for long where nobody publishes."""
-        patience_s = _ABSENT_S if topic in self._heard else _FIRST_ABSENT_S
+        patience_s = _ABSENT_S if topic in self._heard else FIRST_ABSENT_S
         item = buffer.wait(stamp_ns, patience_s)
         present = self._node.count_publishers(topic) > 0
         if item is None and present:

@@ -15,6 +15,7 @@ from bdgs_ros.core import se3
 from bdgs_ros.core.types import Pose, StampedPose, TrackingResult, Trajectory
 
 _PATH_POSES = 2000
+_POLL_S = 0.02
 
 
 class PoseOutput:
@@ -53,6 +54,12 @@ class PoseOutput:
     def publish_move(self, stamp_ns: int, T_new_old: Pose) -> None:
         """Say that the poses from a frame on are in a world that has moved."""
         self._move.publish(conversions.motion_stamped(T_new_old, stamp_ns, self._config.map_frame))
+
+    def wait_for_mapping(self, patience_s: float) -> None:
+        """Wait until somebody listens to keyframes: discovery may be under way, or there is none."""
+        deadline = time.monotonic() + patience_s
+        while not self._keyframe.get_subscription_count() and time.monotonic() < deadline:
+            time.sleep(_POLL_S)
 
     def publish(self, result: TrackingResult, image_frame: str) -> None:
         """Publish the pose of a frame that was tracked."""

@@ -13,7 +13,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from std_msgs.msg import Empty
 
 from bdgs_ros.bridge import parameters, topics
-from bdgs_ros.bridge.feedback import Feedback
+from bdgs_ros.bridge.feedback import FIRST_ABSENT_S, Feedback
 from bdgs_ros.bridge.frames import FrameDecoder, FrameSource, RawFrame
 from bdgs_ros.bridge.governor import Shed
 from bdgs_ros.bridge.health import Health
@@ -150,9 +150,11 @@ class TrackingNode(GraphNode):
 
     def _announced(self, result: TrackingResult) -> TrackingResult:
         """Under the greatest load every other keyframe is one to tracking alone."""
-        if not result.is_keyframe or self._config.lockstep:
+        if not result.is_keyframe:
             return result
         self._keyframes += 1
+        if self._config.lockstep and self._keyframes == 1:
+            self._output.wait_for_mapping(FIRST_ABSENT_S)  # the first one would be lost on it
         is_left_out = self._load.level >= Shed.KEYFRAMES and self._keyframes % 2 == 0
         self._health.counts['keyframes_left_out'] += is_left_out
         return replace(result, is_keyframe=not is_left_out)
