@@ -56,7 +56,7 @@ class PoseOutput:
         self._move.publish(conversions.motion_stamped(T_new_old, stamp_ns, self._config.map_frame))
 
     def wait_for_mapping(self, patience_s: float) -> None:
-        """Wait until somebody listens to keyframes: discovery may be under way, or there is none."""
+        """Wait until somebody listens to keyframes: discovery may be under way."""
         deadline = time.monotonic() + patience_s
         while not self._keyframe.get_subscription_count() and time.monotonic() < deadline:
             time.sleep(_POLL_S)
