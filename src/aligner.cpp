@@ -951,32 +951,129 @@ struct Maps {
   std::vector<uint8_t> valid;
 };
 
-// z-buffer of the reference seen from the current camera: nearest depth and its grey value
-void splat(const Points& points, const Level& target, const State& s, float min_static,
-           Plane& inverse_depth, Plane& grey) {
-  for (int i = 0; i < points.size(); ++i) {
-    if (points.p_static[i] < min_static) continue;
-    const float X = points.x[i], Y = points.y[i], Z = points.z[i];
+// Where points of the reference lie in the current image, and their inverse depth; 0 outside.
+BDGS_INLINE void project_block_body(const Points* points, int begin, int n, const Level* level,
+                                    const State* state, float min_static, int* __restrict at,
+                                    float* __restrict inverse_depth) {
+  const float* __restrict px = points->x.data() + begin;
+  const float* __restrict py_ = points->y.data() + begin;
+  const float* __restrict pz = points->z.data() + begin;
+  const float* __restrict p_static = points->p_static.data() + begin;
+  const State s = *state;
+  const int width = level->width;
+  const float fx = level->fx, fy = level->fy, cx = level->cx, cy = level->cy;
+  const float max_u = level->width - 0.5f, max_v = level->height - 0.5f;
+  const float rows = static_cast<float>(level->height);
+#pragma omp simd
+  for (int i = 0; i < n; ++i) {
+    const float X = px[i], Y = py_[i], Z = pz[i];
     const float xm = s.R[0] * X + s.R[1] * Y + s.R[2] * Z + s.t[0];
     const float ym = s.R[3] * X + s.R[4] * Y + s.R[5] * Z + s.t[1];
     const float zm = s.R[6] * X + s.R[7] * Y + s.R[8] * Z + s.t[2];
-    if (!(zm > 0.05f)) continue;
-    const float r = row_share(target.fy * ym / zm + target.cy, static_cast<float>(target.height));
-    const float z = zm - r * (s.sweep[2] + s.sweep[3] * ym - s.sweep[4] * xm);
-    if (!(z > 0.05f)) continue;
-    const float iz = 1.0f / z;
+    const float r = row_share(fy * ym / (zm > 0.05f ? zm : 1.0f) + cy, rows);
+    const float z_raw = zm - r * (s.sweep[2] + s.sweep[3] * ym - s.sweep[4] * xm);
+    const float iz = 1.0f / (z_raw > 0.05f ? z_raw : 1.0f);
     const float x = xm - r * (s.sweep[0] + s.sweep[4] * zm - s.sweep[5] * ym);
     const float y = ym - r * (s.sweep[1] + s.sweep[5] * xm - s.sweep[3] * zm);
-    const float u = target.fx * x * iz + target.cx, v = target.fy * y * iz + target.cy;
-    if (!(u > -0.5f && v > -0.5f && u < target.width - 0.5f && v < target.height - 0.5f)) continue;
-    const size_t at = static_cast<size_t>(static_cast<int>(v + 0.5f)) * target.width +
-                      static_cast<int>(u + 0.5f);
-    if (iz > inverse_depth[at]) {
-      inverse_depth[at] = iz;
-      grey[at] = points.grey[i];
+    const float u_raw = fx * x * iz + cx, v_raw = fy * y * iz + cy;
+    const bool seen = p_static[i] >= min_static && zm > 0.05f && z_raw > 0.05f && u_raw > -0.5f &&
+                      v_raw > -0.5f && u_raw < max_u && v_raw < max_v;
+    const float u = seen ? u_raw : 0.0f, v = seen ? v_raw : 0.0f;
+    at[i] = static_cast<int>(v + 0.5f) * width + static_cast<int>(u + 0.5f);
+    inverse_depth[i] = seen ? iz : 0.0f;
+  }
+}
+BDGS_VERSIONS(project_block,
+              (const Points* points, int begin, int n, const Level* level, const State* state,
+               float min_static, int* __restrict at, float* __restrict inverse_depth),
+              (points, begin, n, level, state, min_static, at, inverse_depth))
+
+// z-buffer of the reference seen from the current camera: nearest depth and its grey value
+void splat(const Points& points, const Level& target, const State& s, float min_static,
+           Plane& inverse_depth, Plane& grey) {
+  alignas(64) int at[kBlock];
+  alignas(64) float iz[kBlock];
+  for (int begin = 0; begin < points.size(); begin += kBlock) {
+    const int n = std::min(kBlock, points.size() - begin);
+    project_block(&points, begin, n, &target, &s, min_static, at, iz);
+    for (int i = 0; i < n; ++i) {
+      if (iz[i] > inverse_depth[at[i]]) {
+        inverse_depth[at[i]] = iz[i];
+        grey[at[i]] = points.grey[begin + i];
+      }
     }
   }
 }
+
+// The range of what a row of the z-buffer holds within one pixel to either side; the planes have
+// a pixel more on each side, and where the z-buffer is empty they say so by these values.
+constexpr float kNone = 1e9f;
+
+struct Range {
+  Plane top, low, dark, bright;
+  explicit Range(int n) : top(n), low(n), dark(n), bright(n) {}
+};
+
+BDGS_INLINE void range_row_body(const float* __restrict near, const float* __restrict far,
+                                const float* __restrict dark, const float* __restrict bright,
+                                int n, Range* range) {
+  float* __restrict top = range->top.data();
+  float* __restrict low = range->low.data();
+  float* __restrict out_dark = range->dark.data();
+  float* __restrict out_bright = range->bright.data();
+#pragma omp simd
+  for (int u = 0; u < n; ++u) {
+    top[u] = max_f(max_f(near[u], near[u + 1]), near[u + 2]);
+    low[u] = min_f(min_f(far[u], far[u + 1]), far[u + 2]);
+    out_dark[u] = min_f(min_f(dark[u], dark[u + 1]), dark[u + 2]);
+    out_bright[u] = max_f(max_f(bright[u], bright[u + 1]), bright[u + 2]);
+  }
+}
+BDGS_VERSIONS(range_row,
+              (const float* __restrict near, const float* __restrict far,
+               const float* __restrict dark, const float* __restrict bright, int n, Range* range),
+              (near, far, dark, bright, n, range))
+
+struct CompareRow {
+  const float *model, *image, *shade;  // inverse depth of both, and the image's grey
+  const Range *above, *here, *below;
+  float *depth_sigma, *color;
+  uint8_t* valid;
+};
+
+BDGS_INLINE void compare_row_body(const CompareRow* row, int n, float gain, float bias,
+                                  float depth_noise) {
+  const float* __restrict model = row->model;
+  const float* __restrict image = row->image;
+  const float* __restrict shade = row->shade;
+  const Range &a = *row->above, &b = *row->here, &c = *row->below;
+  const float *top_a = a.top.data(), *top_b = b.top.data(), *top_c = c.top.data();
+  const float *low_a = a.low.data(), *low_b = b.low.data(), *low_c = c.low.data();
+  const float *dark_a = a.dark.data(), *dark_b = b.dark.data(), *dark_c = c.dark.data();
+  const float *bright_a = a.bright.data(), *bright_b = b.bright.data(), *bright_c = c.bright.data();
+  float* __restrict depth_sigma = row->depth_sigma;
+  float* __restrict color = row->color;
+  uint8_t* __restrict valid = row->valid;
+#pragma omp simd
+  for (int u = 0; u < n; ++u) {
+    const bool both = model[u] > 0 && image[u] > 0;
+    const float top = max_f(max_f(top_a[u], top_b[u]), top_c[u]);
+    const float low = min_f(min_f(low_a[u], low_b[u]), low_c[u]);
+    const float dark = min_f(min_f(dark_a[u], dark_b[u]), dark_c[u]);
+    const float bright = max_f(max_f(bright_a[u], bright_b[u]), bright_c[u]);
+    const float z = 1.0f / (both ? image[u] : 1.0f);
+    const float nearest = 1.0f / (both ? top : 1.0f), farthest = 1.0f / (both ? low : 1.0f);
+    const float bound = min_f(max_f(z, nearest), farthest);  // of the model, nearest to z
+    const float sigma = depth_noise * __builtin_sqrtf(z * z * z * z + bound * bound * bound * bound);
+    const float shown = min_f(max_f(shade[u], gain * dark + bias), gain * bright + bias);
+    depth_sigma[u] = both ? (bound - z) / sigma : 0.0f;
+    color[u] = both ? shown - shade[u] : 0.0f;
+    valid[u] = both ? 1 : 0;
+  }
+}
+BDGS_VERSIONS(compare_row,
+              (const CompareRow* row, int n, float gain, float bias, float depth_noise),
+              (row, n, gain, bias, depth_noise))
 
 Maps compare(const Level& target, const Plane& inverse_depth, const Plane& grey, const State& s,
              float depth_noise) {
@@ -984,29 +1081,29 @@ Maps compare(const Level& target, const Plane& inverse_depth, const Plane& grey,
   const Images& image = *target.images;
   Maps maps{Plane(inverse_depth.size()), Plane(inverse_depth.size()),
             std::vector<uint8_t>(inverse_depth.size())};
-  for (int v = 0; v < h; ++v) {
+  const int padded = w + 2;
+  Plane near(padded, 0.0f), far(padded, kNone), dark(padded, kNone), bright(padded, -kNone);
+  std::array<Range, 3> ranges{Range(w), Range(w), Range(w)};
+  auto find_range = [&](int v) {  // of one row, empty outside the image
     for (int u = 0; u < w; ++u) {
-      const size_t at = static_cast<size_t>(v) * w + u;
-      if (!(inverse_depth[at] > 0 && image.inverse_depth[at] > 0)) continue;
-      float top = 0, low = 1e9f, dark = 1e9f, bright = -1e9f;
-      for (int j = std::max(v - 1, 0); j <= std::min(v + 1, h - 1); ++j) {
-        for (int i = std::max(u - 1, 0); i <= std::min(u + 1, w - 1); ++i) {
-          const size_t k = static_cast<size_t>(j) * w + i;
-          if (!(inverse_depth[k] > 0)) continue;
-          top = std::max(top, inverse_depth[k]);
-          low = std::min(low, inverse_depth[k]);
-          dark = std::min(dark, grey[k]);
-          bright = std::max(bright, grey[k]);
-        }
-      }
-      const float z = 1.0f / image.inverse_depth[at];
-      const float bound = std::clamp(z, 1.0f / top, 1.0f / low);  // of the model, nearest to z
-      const float sigma = depth_noise * std::sqrt(z * z * z * z + bound * bound * bound * bound);
-      const float shade = image.grey[at];
-      maps.depth_sigma[at] = (bound - z) / sigma;
-      maps.color[at] = std::clamp(shade, s.gain * dark + s.bias, s.gain * bright + s.bias) - shade;
-      maps.valid[at] = 1;
+      const size_t at = static_cast<size_t>(std::clamp(v, 0, h - 1)) * w + u;
+      const bool seen = v >= 0 && v < h && inverse_depth[at] > 0;
+      near[u + 1] = seen ? inverse_depth[at] : 0.0f;
+      far[u + 1] = seen ? inverse_depth[at] : kNone;
+      dark[u + 1] = seen ? grey[at] : kNone;
+      bright[u + 1] = seen ? grey[at] : -kNone;
     }
+    range_row(near.data(), far.data(), dark.data(), bright.data(), w, &ranges[(v + 3) % 3]);
+  };
+  find_range(-1);
+  find_range(0);
+  for (int v = 0; v < h; ++v) {
+    find_range(v + 1);
+    const size_t at = static_cast<size_t>(v) * w;
+    const CompareRow row{&inverse_depth[at],       &image.inverse_depth[at], &image.grey[at],
+                         &ranges[(v + 2) % 3],     &ranges[v % 3],           &ranges[(v + 1) % 3],
+                         &maps.depth_sigma[at],    &maps.color[at],          &maps.valid[at]};
+    compare_row(&row, w, s.gain, s.bias, depth_noise);
   }
   return maps;
 }
