@@ -106,6 +106,7 @@ class BdgsSlam:
         if moved is not None:
             self.mapper.history.note_move(frame.stamp_ns, moved)
         tracking = self.tracker.process(frame, labels)
+        self.tracker.rest()
         if tracking.status is TrackingStatus.OK:
             self.back_end.observe(frame.stamp_ns, tracking.T_world_camera)
         if tracking.is_keyframe:

@@ -386,31 +386,36 @@ BDGS_INLINE float row_share(float v, float rows) {
 
 constexpr float kLeastStatic = 0.02f;  // what surely moves is not worth its time
 
-// Points where the camera sees them in the middle of its readout.
+// Points where the camera sees them in the middle of its readout. Every pixel is written, and the
+// next one over it where it is none: a branch per pixel would cost more.
 void collect_points(Level& level, const Sweep& s) {
   const Images& images = *level.images;
   Points& points = level.points;
-  const size_t n = static_cast<size_t>(level.width) * level.height;
-  for (Plane* plane : {&points.x, &points.y, &points.z, &points.grey, &points.gx, &points.gy,
-                       &points.p_static})
-    plane->reserve(n);
+  const std::array<Plane*, 7> planes = {&points.x,  &points.y,  &points.z,       &points.grey,
+                                        &points.gx, &points.gy, &points.p_static};
+  for (Plane* plane : planes) plane->resize(static_cast<size_t>(level.width) * level.height);
+  float *x = points.x.data(), *y = points.y.data(), *z = points.z.data();
+  float *grey = points.grey.data(), *gx = points.gx.data(), *gy = points.gy.data();
+  float* p_static = points.p_static.data();
+  size_t count = 0;
   for (int v = 1; v + 1 < level.height; ++v) {
+    const float r = row_share(static_cast<float>(v), static_cast<float>(level.height));
     for (int u = 1; u + 1 < level.width; ++u) {
       const size_t i = static_cast<size_t>(v) * level.width + u;
       const float inverse = images.inverse_depth[i];
-      if (inverse <= 0 || level.p_static[i] < kLeastStatic) continue;
-      const float r = row_share(static_cast<float>(v), static_cast<float>(level.height));
-      const float z = 1.0f / inverse;
-      const float x = (u - level.cx) / level.fx * z, y = (v - level.cy) / level.fy * z;
-      points.x.push_back(x + r * (s[0] + s[4] * z - s[5] * y));
-      points.y.push_back(y + r * (s[1] + s[5] * x - s[3] * z));
-      points.z.push_back(z + r * (s[2] + s[3] * y - s[4] * x));
-      points.grey.push_back(images.grey[i]);
-      points.gx.push_back(images.gx[i]);
-      points.gy.push_back(images.gy[i]);
-      points.p_static.push_back(level.p_static[i]);
+      const float c = 1.0f / inverse;
+      const float a = (u - level.cx) / level.fx * c, b = (v - level.cy) / level.fy * c;
+      x[count] = a + r * (s[0] + s[4] * c - s[5] * b);
+      y[count] = b + r * (s[1] + s[5] * a - s[3] * c);
+      z[count] = c + r * (s[2] + s[3] * b - s[4] * a);
+      grey[count] = images.grey[i];
+      gx[count] = images.gx[i];
+      gy[count] = images.gy[i];
+      p_static[count] = level.p_static[i];
+      count += inverse > 0 && level.p_static[i] >= kLeastStatic;
     }
   }
+  for (Plane* plane : planes) plane->resize(count);
 }
 
 const Points& points_of(Pyramid& pyramid, int index) {

@@ -146,6 +146,7 @@ def _run(fault: Fault, config: Any) -> Watch:
         start = time.perf_counter()
         result = slam.tracker.process(frame, labels)
         watch.tracking_ms.append(1e3 * (time.perf_counter() - start))
+        slam.tracker.rest()
         if result.is_keyframe:
             keyframe = Keyframe(frame, result.T_world_camera, labels.p_dynamic)
             slam.tracker.set_model(slam.mapper.process(keyframe))

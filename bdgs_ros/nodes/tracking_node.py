@@ -58,6 +58,7 @@ class TrackingNode(GraphNode):
             self._on_frame,
             self._health.error,
             None if config.lockstep else _MOST_WAITING,
+            idle=self._on_idle,
             is_late=self._load.is_late,
             on_drop=self._on_passed_over,
         )
@@ -186,6 +187,11 @@ class TrackingNode(GraphNode):
         self._health.counts[f'frames_{status.state.value}'] += 1
         self._health.counts['frames_dropped'] = self._worker.dropped
         self._status.publish(status_to_message(status, raw.color.header.frame_id))
+
+    def _on_idle(self) -> None:
+        """After each frame, its pose being out."""
+        if self._has_begun:
+            self._tracker.rest()
 
     def _forget(self) -> None:
         """Start over: the next frame is the origin of the world."""

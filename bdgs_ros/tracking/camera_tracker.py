@@ -238,6 +238,10 @@ class CameraTracker:
             return self._lose(frame, first)
         return self._conclude(frame, attempt)
 
+    def rest(self) -> None:
+        """Do what can wait until the pose is out; call it after each frame, when there is time."""
+        self._places.prepare()
+
     def _prior(self, frame: RgbdFrame, labels: Labels | None) -> ProbabilityImage:
         if labels is None or not self._config.masked:
             return np.zeros(frame.camera.shape, np.uint8)
@@ -385,8 +389,6 @@ class CameraTracker:
             self._become_keyframe(
                 frame, estimate.T_world_camera, attempt.current, attempt.p_dynamic
             )
-        else:
-            self._places.prepare()  # in a frame that is no keyframe there is time
         return _result(frame, attempt, TrackingStatus.OK, is_keyframe)
 
     def _lose(self, frame: RgbdFrame, attempt: Attempt) -> TrackingResult:
