@@ -7,8 +7,10 @@ rotation vector in radians. The exponential follows Sola et al., "A micro Lie th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -17,6 +19,7 @@ Matrix = NDArray[np.float64]
 Vector = NDArray[np.float64]
 
 _SMALL_ANGLE_RAD = 1e-6
+_NEAR_HALF_TURN = -0.99  # cosine
 FARTHEST_CORRECTION_M = 20.0
 """
 Nothing that is seen again justifies moving a keyframe by more: such a loop closes what drifted
@@ -53,16 +56,25 @@ def hat(vector: Vector) -> Matrix:
 def exp(xi: Vector) -> Matrix:
     """Map a tangent vector `(rho, phi)`, shape (6,), to a motion, shape (4, 4)."""
     rho, phi = xi[:3], xi[3:]
-    return from_rotation_translation(
-        Rotation.from_rotvec(phi).as_matrix(), _left_jacobian(phi) @ rho
-    )
+    return from_rotation_translation(np.asarray(cv2.Rodrigues(phi)[0]), _left_jacobian(phi) @ rho)
 
 
 def log(T_a_b: Matrix) -> Vector:
     """Map a motion, shape (4, 4), to its tangent vector `(rho, phi)`, shape (6,)."""
-    phi = Rotation.from_matrix(T_a_b[:3, :3]).as_rotvec()
+    phi = _rotation_vector(T_a_b[:3, :3])
     rho = np.linalg.solve(_left_jacobian(phi), T_a_b[:3, 3])
     return np.concatenate([rho, phi])
+
+
+def _rotation_vector(rotation: Matrix) -> Vector:
+    """Return axis times angle, shape (3,): from the skew part, a tenth of scipy's time."""
+    cosine = 0.5 * (rotation[0, 0] + rotation[1, 1] + rotation[2, 2] - 1)
+    if cosine < _NEAR_HALF_TURN:  # where the skew part vanishes as well
+        return np.asarray(Rotation.from_matrix(rotation).as_rotvec())
+    skew = rotation - rotation.T
+    axis = 0.5 * np.array([skew[2, 1], skew[0, 2], skew[1, 0]])
+    sine = math.sqrt(axis @ axis)
+    return axis * (math.atan2(sine, cosine) / sine if sine > 0 else 1.0)
 
 
 def _left_jacobian(phi: Vector) -> Matrix:
@@ -90,7 +102,7 @@ def to_position_quat_xyzw(T_a_b: Matrix) -> tuple[Vector, Vector]:
 
 def rotation_angle_rad(T_a_b: Matrix) -> float:
     """Return the angle of the rotation part, in [0, pi]."""
-    return float(np.linalg.norm(Rotation.from_matrix(T_a_b[:3, :3]).as_rotvec()))
+    return float(np.linalg.norm(_rotation_vector(T_a_b[:3, :3])))
 
 
 def orthonormalise(T_a_b: Matrix) -> Matrix:

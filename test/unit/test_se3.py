@@ -1,7 +1,10 @@
 """Algebraic properties of rigid motions."""
 
+import math
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from bdgs_ros.core import se3
 
@@ -83,3 +86,18 @@ def test_a_pose_may_be_corrected_by_some_metres_and_to_a_motion() -> None:
         assert se3.is_correction(old, [old[0], T @ old[1]]) == expected
     assert se3.is_correction([], [])
     assert not se3.is_correction(old, [old[0], 1.1 * old[1]])
+
+
+@pytest.mark.parametrize(
+    'angle', [0.0, 1e-12, 1e-8, 1e-4, 0.1, 1.5, 2.9, 3.1, 3.14159, math.pi - 1e-9]
+)
+def test_rotations_are_those_of_scipy(angle: float) -> None:
+    rng = np.random.default_rng(0)
+    for axis in rng.normal(size=(20, 3)):
+        phi = angle * axis / np.linalg.norm(axis)
+        expected = Rotation.from_rotvec(phi).as_matrix()
+        T = se3.exp(np.concatenate([np.zeros(3), phi]))
+        assert np.abs(T[:3, :3] - expected).max() < 1e-14
+        found = se3.log(T)[3:]
+        assert np.abs(Rotation.from_rotvec(found).as_matrix() - expected).max() < 1e-14
+        assert se3.rotation_angle_rad(T) == pytest.approx(angle, abs=1e-8)
