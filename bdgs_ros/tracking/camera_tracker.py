@@ -56,9 +56,7 @@ class CameraTracker:
 
     def __init__(self, config: TrackingConfig) -> None:
         self._config = config
-        # where the map refines the pose, the coarse one is a start
-        coarse = config.align.max_points // (2 if config.refine.enabled else 1)
-        self._aligner = Aligner(replace(config.align, max_points=coarse))
+        self._aligner = Aligner(config.align)
         self._refiner = Aligner(
             replace(
                 config.align,
