@@ -7,6 +7,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <string>
 #include <tuple>
 #include <utility>
 #include <vector>
@@ -269,12 +270,29 @@ Condensed condense_corners(const std::vector<Corner>& corners, Pose T, const Twi
   }
 }
 
+void check_size(const Array& array, ptrdiff_t expected, const char* name) {
+  if (array.size() != expected)
+    throw py::value_error(std::string(name) + ": expected " + std::to_string(expected) +
+                          " numbers, received " + std::to_string(array.size()));
+}
+
 std::tuple<Array, double, Array, Array, int> condense(
     Array tangents, Array inverse, Array tangents_other, Array inverse_other, Array rows,
     Array p_static, Array bends, Array bends_other, Array T_other_one, Array twist_one,
     Array twist_other, Array bend, double readout_s, double readout_sigma_s, double px,
     double inverse_depth_sigma, double dof, int rounds) {
-  const ptrdiff_t count = inverse.shape(0);
+  const ptrdiff_t count = inverse.size();
+  check_size(tangents, 2 * count, "tangents");
+  check_size(tangents_other, 2 * count, "tangents_other");
+  check_size(inverse_other, count, "inverse_depth_other");
+  check_size(rows, 2 * count, "rows");
+  check_size(p_static, count, "p_static");
+  check_size(bends, kBends * count, "bend functions");
+  check_size(bends_other, kBends * count, "bend functions of the other view");
+  check_size(T_other_one, 16, "T_other_one");
+  check_size(twist_one, 6, "twist of the one view");
+  check_size(twist_other, 6, "twist of the other view");
+  check_size(bend, kBends, "bend");
   Pose T;
   const double* m = T_other_one.data();
   for (int i = 0; i < 3; ++i) {

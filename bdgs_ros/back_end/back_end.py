@@ -9,6 +9,7 @@ all poses and the camera's calibration are solved for (`graph`).
 from __future__ import annotations
 
 import logging
+import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -274,8 +275,8 @@ class BackEnd:
         readout_s = abs(self.calibration.readout_s) + self._readout_sigma_s
         wrong_s = abs(factor.held_readout_s - self.calibration.readout_s)
         return max(
-            wrong_s * float(np.linalg.norm(self._views[stamp_ns].twist[3:]))
-            + readout_s * float(np.linalg.norm(self._views[stamp_ns].twist[3:] - twist[3:]))
+            wrong_s * math.hypot(*self._views[stamp_ns].twist[3:])
+            + readout_s * math.dist(self._views[stamp_ns].twist[3:], twist[3:])
             for stamp_ns, twist in zip(key, factor.twists, strict=True)
         )
 

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from bdgs_ros.back_end.calibration import SIZE, Calibration, Known
 from bdgs_ros.back_end.pair import PairFactor
+from bdgs_ros.core import se3
 from bdgs_ros.core.bend import BENDS
 from bdgs_ros.core.config.back_end import BundleConfig
 from bdgs_ros.core.types import Pose
@@ -300,8 +301,10 @@ def _apart(world: Array, pairs: _Pairs) -> Array:
     rho = change[:, :3, 3]
     half = np.maximum(0.5 * np.linalg.norm(phi, axis=1, keepdims=True), _SMALL_RAD)
     share = (1 - half / np.tan(half)) / (2 * half) ** 2  # 1/12 where the turn is small
-    second = share * np.cross(phi, np.cross(phi, rho))
-    return np.concatenate([rho - 0.5 * np.cross(phi, rho) + second, phi], axis=1)
+    turn = se3.hats(phi)
+    once = np.matmul(turn, rho[:, :, None])
+    twice = np.matmul(turn, once)[:, :, 0]
+    return np.concatenate([rho - 0.5 * once[:, :, 0] + share * twice, phi], axis=1)
 
 
 def _times(pairs: _Pairs, y: Array) -> Array:
@@ -397,26 +400,23 @@ def _slopes(pairs: _Pairs, world: Array, xi: Array) -> Array:
     """Return the derivatives of xi by a move of `one`, [M, 6, 6]; by `other` their negatives."""
     adjoint = _adjoints(_inverses(world[pairs.other]))
     turning = np.zeros((len(xi), 6, 6))
-    turning[:, :3, :3] = turning[:, 3:, 3:] = _hats(xi[:, 3:])
-    turning[:, :3, 3:] = _hats(xi[:, :3])
+    turning[:, :3, :3] = turning[:, 3:, 3:] = se3.hats(xi[:, 3:])
+    turning[:, :3, 3:] = se3.hats(xi[:, :3])
     # The inverse of the left Jacobian to second order.
     return np.asarray(adjoint - turning @ (0.5 * adjoint - turning @ adjoint / 12))
-
-
-def _hats(vectors: Array) -> Array:
-    """Return the skew-symmetric matrices of vectors, [M, 3, 3]."""
-    return np.cross(vectors[:, None, :], np.eye(3)).swapaxes(1, 2)
 
 
 def _exponentials(xi: Array) -> Array:
     """Return `se3.exp` of tangent vectors, [N, 6], as motions, [N, 4, 4]."""
     rho, phi = xi[:, :3], xi[:, 3:]
     angle = np.maximum(np.linalg.norm(phi, axis=1, keepdims=True), _SMALL_RAD)
-    once = np.cross(phi, rho)
+    turn = se3.hats(phi)
+    once = np.matmul(turn, rho[:, :, None])
+    twice = np.matmul(turn, once)[:, :, 0]
     T = np.zeros((len(xi), 4, 4))
     T[:, :3, :3] = Rotation.from_rotvec(phi).as_matrix()
-    T[:, :3, 3] = rho + (1 - np.cos(angle)) / angle**2 * once
-    T[:, :3, 3] += (angle - np.sin(angle)) / angle**3 * np.cross(phi, once)
+    T[:, :3, 3] = rho + (1 - np.cos(angle)) / angle**2 * once[:, :, 0]
+    T[:, :3, 3] += (angle - np.sin(angle)) / angle**3 * twice
     T[:, 3, 3] = 1
     return T
 
@@ -435,5 +435,5 @@ def _adjoints(T: Array) -> Array:
     rotation = T[:, :3, :3]
     result = np.zeros((len(T), 6, 6))
     result[:, :3, :3] = result[:, 3:, 3:] = rotation
-    result[:, :3, 3:] = np.cross(T[:, None, :3, 3], np.swapaxes(rotation, 1, 2)).swapaxes(1, 2)
+    result[:, :3, 3:] = se3.hats(T[:, :3, 3]) @ rotation
     return result

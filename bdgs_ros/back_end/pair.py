@@ -208,7 +208,7 @@ def linearise(
 
     by_motion = np.zeros((len(shared), 3, 7))  # of `point` by xi and by the readout
     by_motion[:, :, :3] = inverse[:, None, None] * np.eye(3)
-    by_motion[:, :, 3:6] = -_hats(point)
+    by_motion[:, :, 3:6] = -se3.hats(point)
     by_motion[:, :, 6] = during_one @ rotation.T - during_other
     depth = 1 / point[:, 2]
     at = point[:, :2] * depth[:, None]
@@ -276,11 +276,3 @@ def _eliminate(linear: _Linear, weight: Array) -> tuple[Array, Array, tuple[Arra
     information = weighted.T @ J.reshape(-1, UNKNOWNS) - (cross / own[:, None]).T @ cross
     gradient = weighted.T @ r.ravel() - cross.T @ (right / own)
     return information, gradient, (-right / own, -cross / own[:, None])
-
-
-def _hats(points: Array) -> Array:
-    """Return the skew-symmetric matrices of points, [N, 3, 3]."""
-    x, y, z = points.T
-    zero = np.zeros_like(x)
-    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
-    return np.asarray(np.moveaxis(np.array(rows), 2, 0))

@@ -53,6 +53,15 @@ def hat(vector: Vector) -> Matrix:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
+def hats(vectors: Matrix) -> Matrix:
+    """Return `hat` of each vector, shape (N, 3), as (N, 3, 3)."""
+    x, y, z = vectors.T
+    result = np.zeros((len(vectors), 3, 3))
+    result[:, 0, 1], result[:, 0, 2], result[:, 1, 2] = -z, y, -x
+    result[:, 1, 0], result[:, 2, 0], result[:, 2, 1] = z, -y, x
+    return result
+
+
 def exp(xi: Vector) -> Matrix:
     """Map a tangent vector `(rho, phi)`, shape (6,), to a motion, shape (4, 4)."""
     rho, phi = xi[:3], xi[3:]

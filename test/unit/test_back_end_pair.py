@@ -242,3 +242,12 @@ def test_the_kernel_agrees_with_its_twin(seed: int) -> None:
     # at the optimum the pull of the motion is what is left of large numbers
     assert np.abs(fast.gradient - slow.gradient).max() < 1e-8 * scale
     assert fast.inliers == slow.inliers
+
+
+def test_the_kernel_refuses_arrays_that_do_not_fit() -> None:
+    pytest.importorskip('bdgs_ros._two_views')
+    one, other = motions(2)
+    shared = Room.random(Calibration.perfect()).share(one, other)
+    short = replace(shared, p_static=shared.p_static[:-1])
+    with pytest.raises(ValueError, match='p_static: expected 60 numbers, received 59'):
+        condense(short, one, (STILL, STILL), Calibration.perfect(), SIGMA_S, FOCAL, CONFIG)

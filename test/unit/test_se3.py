@@ -101,3 +101,10 @@ def test_rotations_are_those_of_scipy(angle: float) -> None:
         found = se3.log(T)[3:]
         assert np.abs(Rotation.from_rotvec(found).as_matrix() - expected).max() < 1e-14
         assert se3.rotation_angle_rad(T) == pytest.approx(angle, abs=1e-8)
+
+
+def test_hats_are_cross_products() -> None:
+    vectors = np.random.default_rng(0).normal(size=(5, 3))
+    for hat, vector in zip(se3.hats(vectors), vectors, strict=True):
+        assert (hat == se3.hat(vector)).all()
+        assert hat @ [1.0, 2.0, 3.0] == pytest.approx(np.cross(vector, [1.0, 2.0, 3.0]))
