@@ -107,54 +107,14 @@ def condense(
         Use the kernel where it was built; otherwise its twin in numpy.
 
     """
-    arguments = shared, T_other_one, twists, calibration, readout_sigma_s, focal_px, config
     if native and _kernels is not None:
-        return _condense_native(*arguments)
-    return _condense_numpy(*arguments)
-
-
-def _condense_native(
-    shared: Shared,
-    T_other_one: Pose,
-    twists: tuple[Array, Array],
-    calibration: Calibration,
-    readout_sigma_s: float,
-    focal_px: float,
-    config: BundleConfig,
-) -> PairFactor:
-    assert _kernels is not None
-    T, readout_s, information, gradient, inliers = _kernels.condense(
-        shared.tangents,
-        shared.inverse_depth,
-        shared.tangents_other,
-        shared.inverse_depth_other,
-        shared.rows,
-        shared.p_static,
-        bend_functions(shared.tangents),
-        bend_functions(shared.tangents_other),
-        T_other_one,
-        *twists,
-        calibration.bend,
-        calibration.readout_s,
-        readout_sigma_s,
-        focal_px / config.pixel_sigma,
-        config.inverse_depth_sigma,
-        config.dof,
-        _ROUNDS,
-    )
-    at = replace(calibration, readout_s=readout_s)
-    return PairFactor(T, at, calibration.readout_s, twists, information, gradient, inliers)
-
-
-def _condense_numpy(
-    shared: Shared,
-    T_other_one: Pose,
-    twists: tuple[Array, Array],
-    calibration: Calibration,
-    readout_sigma_s: float,
-    focal_px: float,
-    config: BundleConfig,
-) -> PairFactor:
+        noise = focal_px / config.pixel_sigma, config.inverse_depth_sigma, config.dof
+        T, readout_s, information, gradient, inliers = _kernels.condense(
+            *_measured(shared), T_other_one, *twists,
+            calibration.bend, calibration.readout_s, readout_sigma_s, *noise, _ROUNDS,
+        )  # fmt: skip
+        at = replace(calibration, readout_s=readout_s)
+        return PairFactor(T, at, calibration.readout_s, twists, information, gradient, inliers)
     T, at = np.asarray(T_other_one, np.float64), calibration
     bent = bend_functions(shared.tangents) @ calibration.bend
     inverse = shared.inverse_depth + bent
@@ -172,6 +132,20 @@ def _condense_numpy(
         at = replace(at, readout_s=at.readout_s + float(step[6]))
     inliers = int((np.abs(linear.residuals[:, :3]) < 3).all(axis=1).sum())
     return PairFactor(T, at, calibration.readout_s, twists, information, gradient, inliers)
+
+
+def _measured(shared: Shared) -> tuple[Array, ...]:
+    """Return what is known of the corners, as the kernel takes it."""
+    return (
+        shared.tangents,
+        shared.inverse_depth,
+        shared.tangents_other,
+        shared.inverse_depth_other,
+        shared.rows,
+        shared.p_static,
+        bend_functions(shared.tangents),
+        bend_functions(shared.tangents_other),
+    )
 
 
 def _step(information: Array, gradient: Array, known: tuple[float, float]) -> Array:

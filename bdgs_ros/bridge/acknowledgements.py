@@ -18,7 +18,7 @@ class Acknowledgements:
 
     """
 
-    def __init__(self, passed_over: str = 'passed over') -> None:
+    def __init__(self, passed_over: str = '') -> None:
         self._passed_over = passed_over
         self.states: Counter[str] = Counter()
         self.sent = 0

@@ -16,6 +16,7 @@ from dataclasses import replace
 from bdgs_ros.back_end.back_end import BackEnd
 from bdgs_ros.core import se3
 from bdgs_ros.core.types import Keyframe, ModelView, Pose, StampedPose
+from bdgs_ros.mapping.history import Move, moved_between
 from bdgs_ros.mapping.mapper import Mapper
 from bdgs_ros.pipeline import Adjustment, adjust
 
@@ -60,7 +61,7 @@ class Adjuster:
         self._poses: dict[int, Pose] = {}  # in the mapper
         self._waiting: list[Adjustment] = []  # that the mapper has not made yet
         self._adjusted: set[int] = set()
-        self._moves: list[StampedPose] = []  # of tracking's world, since the last keyframe
+        self._moves: list[Move] = []  # since the last keyframe
         self._last: StampedPose | None = None  # keyframe, as tracking gave it
 
     def forget(self) -> None:
@@ -110,12 +111,13 @@ class Adjuster:
         """
         with self._lock:
             run, poses = self._run, self._present()
-            moves = self._take_moves(keyframe.frame.stamp_ns)
-            T_placed_tracked = self._placement(keyframe, poses, moves)
+            stamp_ns, moves = keyframe.frame.stamp_ns, self._moves
+            T_placed_tracked = self._placement(keyframe, poses)
+            self._moves = [move for move in moves if move[0] > stamp_ns]
         here = se3.identity() if T_placed_tracked is None else T_placed_tracked
         with self._busy:
             for pose in tracked:
-                T_tracked_then = _product(moves, after_ns=pose.stamp_ns)
+                T_tracked_then = moved_between(moves, pose.stamp_ns, stamp_ns)
                 T_world_camera = here @ T_tracked_then @ pose.T_world_camera
                 self._back_end.observe(pose.stamp_ns, T_world_camera)
             adjustment = adjust(self._back_end, keyframe, poses, T_placed_tracked)
@@ -131,16 +133,10 @@ class Adjuster:
     def note_move(self, stamp_ns: int, T_new_old: Pose) -> None:
         """Take by what tracking moved its world before the frame of a stamp."""
         with self._lock:
-            self._moves.append(StampedPose(stamp_ns, T_new_old))
+            if self._at_once:
+                self._moves = [*self._moves, (stamp_ns, T_new_old)]
 
-    def _take_moves(self, until_ns: int) -> list[StampedPose]:
-        taken = [move for move in self._moves if move.stamp_ns <= until_ns]
-        self._moves = [move for move in self._moves if move.stamp_ns > until_ns]
-        return taken if self._at_once else []
-
-    def _placement(
-        self, keyframe: Keyframe, poses: dict[int, Pose], moves: list[StampedPose]
-    ) -> Pose | None:
+    def _placement(self, keyframe: Keyframe, poses: dict[int, Pose]) -> Pose | None:
         """
         Return what takes a keyframe to the world as it is here; None where that is tracking's.
 
@@ -151,7 +147,8 @@ class Adjuster:
         last, self._last = self._last, new
         if not self._at_once or last is None or last.stamp_ns not in poses:
             return None
-        T_tracked_last = _product(moves, after_ns=last.stamp_ns) @ last.T_world_camera
+        moved = moved_between(self._moves, last.stamp_ns, new.stamp_ns)
+        T_tracked_last = moved @ last.T_world_camera
         return se3.orthonormalise(poses[last.stamp_ns] @ se3.inverse(T_tracked_last))
 
     def into_map(self, keyframe: Keyframe, adjustment: Adjustment) -> bool:
@@ -216,12 +213,3 @@ class Adjuster:
         for adjustment in self._waiting:
             poses = adjustment.moved(poses)
         return poses
-
-
-def _product(moves: list[StampedPose], after_ns: int) -> Pose:
-    """Return by what a world has moved since a stamp."""
-    T_now_then = se3.identity()
-    for move in moves:
-        if move.stamp_ns > after_ns:
-            T_now_then = move.T_world_camera @ T_now_then
-    return T_now_then

@@ -60,7 +60,7 @@ class Governor:
         """Why the level is not zero, with numbers."""
         self._arrivals: deque[float] = deque(maxlen=_INTERVALS)
         self._ages_s: deque[float] = deque(maxlen=_POSES)  # of images when their poses came
-        self._passed_over = 0  # since the last change
+        self._passed_over = 0  # since they were last looked at
         self._changed_s = -np.inf
         self._pressed_s = -np.inf
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import resource
 import signal
 import sys
 import threading
@@ -49,7 +48,7 @@ def go_first(priority: int) -> str:
     """
     if not priority:
         return ''
-    if not sys.platform.startswith('linux') or processors() < 2:
+    if not _is_safe():
         return 'real-time scheduling: not on this system; ordinary priorities'
     try:
         _bound_run_time()
@@ -65,7 +64,7 @@ def go_first(priority: int) -> str:
 
 def may_go_first(priority: int) -> bool:
     """Return whether the system would grant a real-time priority; nothing stays changed."""
-    if not priority or not sys.platform.startswith('linux') or processors() < 2:
+    if not (priority and _is_safe()):
         return False
     try:
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(priority))
@@ -75,7 +74,14 @@ def may_go_first(priority: int) -> bool:
     return True
 
 
+def _is_safe() -> bool:
+    """Return whether a real-time thread can be bounded and leaves a processor to others."""
+    return sys.platform.startswith('linux') and processors() > 1
+
+
 def _bound_run_time() -> None:
+    import resource  # Unix has it
+
     _, hard = resource.getrlimit(resource.RLIMIT_RTTIME)
     soft = _LONGEST_RUN_US if hard == resource.RLIM_INFINITY else min(_LONGEST_RUN_US, hard)
     resource.setrlimit(resource.RLIMIT_RTTIME, (soft, hard))

@@ -80,13 +80,12 @@ class Worker(Generic[Item]):
 
     def put(self, item: Item) -> None:
         """Append an item; never waits."""
-        dropped = []
         with self._changed:
-            if self._capacity is not None and len(self._items) >= self._capacity:
-                dropped.append(self._items.popleft())
+            is_full = self._capacity is not None and len(self._items) >= self._capacity
+            dropped = self._take_out(int(is_full))
             self._items.append(item)
             self._changed.notify_all()
-        self._drop(dropped)
+        self._hand_back(dropped)
 
     def wake(self) -> None:
         """Have `idle` called soon, when nothing else is to do."""
@@ -147,19 +146,22 @@ class Worker(Generic[Item]):
                 return action
             dropped = self._pass_over()
             call = partial(self._handle, self._items.popleft())
-        self._drop(dropped)
+        self._hand_back(dropped)
         return call
 
     def _pass_over(self) -> list[Item]:
         """Take out all but the newest item if the oldest has waited for too long."""
-        if len(self._items) < 2 or not self._is_late(self._items[0]):
-            return []
-        return [self._items.popleft() for _ in range(len(self._items) - 1)]
+        newer = len(self._items) - 1
+        return self._take_out(newer if newer and self._is_late(self._items[0]) else 0)
 
-    def _drop(self, items: Sequence[Item]) -> None:
-        self.dropped += len(items)
+    def _take_out(self, count: int) -> list[Item]:
+        """Drop the oldest items; the lock is held."""
+        self.dropped += count
+        return [self._items.popleft() for _ in range(count)]
+
+    def _hand_back(self, items: Sequence[Item]) -> None:
         for item in items:
-            self._on_drop(item)
+            self._guarded(partial(self._on_drop, item))
 
     def _guarded(self, call: Callable[[], None]) -> None:
         try:

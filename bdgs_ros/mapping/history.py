@@ -10,7 +10,7 @@ those before that are corrected by all of it, those after by what came later.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 from typing import Any
@@ -23,6 +23,9 @@ from bdgs_ros.core.types import Pose, StampedPose, Trajectory
 from bdgs_ros.mapping.keyframes import MapKeyframe
 
 Array = NDArray[np.float32]
+
+Move = tuple[int, Pose]
+"""The first frame after tracking moved all that it knew, and by what, `T_new_old`."""
 
 _POSES = ('online', 'final')
 
@@ -37,14 +40,23 @@ class Anchor:
     exposure: Array
 
 
+def moved_between(moves: Sequence[Move], earlier_ns: int, later_ns: int) -> Pose:
+    """Return by what tracking moved a frame, `T_new_old`, before it tracked a later one."""
+    first = bisect_right(moves, earlier_ns, key=itemgetter(0))
+    last = bisect_right(moves, later_ns, key=itemgetter(0))
+    moved = se3.identity()
+    for _, T_new_old in moves[first:last]:
+        moved = T_new_old @ moved
+    return moved
+
+
 class History:
     """All keyframes that ever were, also those whose images are forgotten."""
 
     def __init__(self) -> None:
         self._anchors: dict[int, Anchor] = {}
         self._earlier_ns: list[int] = []
-        # By what tracking moved all that it knew, T_new_old, and the first frame after that.
-        self._moves: list[tuple[int, Pose]] = []
+        self._moves: list[Move] = []
 
     @property
     def stamps_ns(self) -> list[int]:
@@ -136,17 +148,8 @@ class History:
     def _held(self, keyframe_ns: int, stamp_ns: int) -> Pose:
         """Return T_final_online at a time that holds the motion since a keyframe."""
         own = self._anchors[keyframe_ns]
-        believed = self._moved_between(keyframe_ns, stamp_ns) @ own.online
+        believed = moved_between(self._moves, keyframe_ns, stamp_ns) @ own.online
         return own.final @ se3.inverse(believed)
-
-    def _moved_between(self, keyframe_ns: int, stamp_ns: int) -> Pose:
-        """Return by what tracking moved a keyframe before it tracked a later frame."""
-        first = bisect_right(self._moves, keyframe_ns, key=itemgetter(0))
-        last = bisect_right(self._moves, stamp_ns, key=itemgetter(0))
-        moved = se3.identity()
-        for _, T_new_old in self._moves[first:last]:
-            moved = T_new_old @ moved
-        return moved
 
     def _around(self, stamp_ns: int) -> tuple[int, int, float]:
         """Return the keyframes before and after a time, and how far between them it lies."""

@@ -140,6 +140,8 @@ class TrackingNode(GraphNode):
         result = self._tracker.process(frame, labels, self._is_hurried())
         tracking_ms = (time.perf_counter() - started) * 1e3
         result = self._announced(result)
+        if result.is_keyframe and self._config.lockstep and self._keyframes == 1:
+            self._output.wait_for_mapping(FIRST_ABSENT_S)  # the first one would be lost on it
         if result.status is TrackingStatus.OK:
             self._feedback.note_keyframe(result, frame.camera)
             self._output.publish(result, raw.color.header.frame_id)
@@ -154,8 +156,6 @@ class TrackingNode(GraphNode):
         if not result.is_keyframe:
             return result
         self._keyframes += 1
-        if self._config.lockstep and self._keyframes == 1:
-            self._output.wait_for_mapping(FIRST_ABSENT_S)  # the first one would be lost on it
         is_left_out = self._load.level >= Shed.KEYFRAMES and self._keyframes % 2 == 0
         self._health.counts['keyframes_left_out'] += is_left_out
         return replace(result, is_keyframe=not is_left_out)

@@ -79,7 +79,16 @@ class LossTest:
 
     def objection(self, quality: AlignResult) -> str:
         """Say in words why a pose is not to be believed; nothing where it is."""
-        limits, found = self._config, self.evidence(quality)
+        found = self.evidence(quality)
+        return self._too_little(found) or self._fall(found) or self._too_open(found)
+
+    def is_doubtful(self, quality: AlignResult) -> bool:
+        """Tell whether nothing speaks against a pose but that the images usually agree better."""
+        found = self.evidence(quality)
+        return not (self._too_little(found) or self._too_open(found))
+
+    def _too_little(self, found: Evidence) -> str:
+        limits = self._config
         # A covered lens agrees with everything at gain 0.
         if not 1 / limits.gain < found.gain < limits.gain:
             return f'exposure gain {found.gain:.2f}'
@@ -87,26 +96,20 @@ class LossTest:
             return f'only {100 * found.coverage:.1f} % of the image could be compared'
         if found.inlier_ratio < limits.inlier_ratio:
             return f'{100 * found.inlier_ratio:.0f} % inliers'
-        if self._ratios and found.relative_ratio < self._least_relative():
-            return f'inliers fell from {100 * self._usual:.0f} to {100 * found.inlier_ratio:.0f} %'
-        if found.sigma_m > limits.sigma_m:
-            return f'the images leave the position open to {found.sigma_m:.2f} m'
         return ''
 
-    def _least_relative(self) -> float:
+    def _fall(self, found: Evidence) -> str:
         """Images that the camera's own turn blurs agree less, and are not wrong for it."""
         turning = min(self.turn_rad_s / _FAST_RAD_S, 1.0)
-        return self._config.relative_ratio * (1 - _BLUR * turning)
+        least = self._config.relative_ratio * (1 - _BLUR * turning)
+        if self._ratios and found.relative_ratio < least:
+            return f'inliers fell from {100 * self._usual:.0f} to {100 * found.inlier_ratio:.0f} %'
+        return ''
 
-    def is_doubtful(self, quality: AlignResult) -> bool:
-        """Tell whether nothing speaks against a pose but that the images usually agree better."""
-        limits, found = self._config, self.evidence(quality)
-        return bool(
-            1 / limits.gain < found.gain < limits.gain
-            and found.coverage >= limits.coverage
-            and found.inlier_ratio >= limits.inlier_ratio
-            and found.sigma_m <= limits.sigma_m
-        )
+    def _too_open(self, found: Evidence) -> str:
+        if found.sigma_m > self._config.sigma_m:
+            return f'the images leave the position open to {found.sigma_m:.2f} m'
+        return ''
 
     def is_sure(self, quality: AlignResult) -> bool:
         """Tell whether one such frame is enough to be found after a loss."""
