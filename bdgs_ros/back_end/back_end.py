@@ -34,7 +34,8 @@ Array = NDArray[np.float64]
 _log = logging.getLogger(__name__)
 
 _RECENT = 300  # poses of frames: keyframes may come late
-_HURRIED_WINDOW = 3  # newest keyframes that a new one is joined with when the next one waits
+_HURRIED_WINDOW, _HURRIED_OLDER = 2, 1  # that a new one is joined with when the next one waits
+_NEWEST = 8  # keyframes that stay, and are no places to be recognised
 _UNLOOKED = 3  # keyframes whose features are found when there is time; older ones are no places
 _RENEWED = 12  # pairs condensed again at a keyframe, at most
 _OFF_RAD = 0.002  # how far the images of a pair may be bent otherwise than it was condensed with
@@ -67,8 +68,8 @@ class BackEnd:
     config : BackEndConfig
         Sizes and noise.
     hurried : callable
-        Asked at each keyframe whether the next one waits already; then it is joined with the
-        newest ones alone. Places that it might show are looked for later.
+        Asked at each keyframe whether the next one waits already; then it is joined with few
+        others. Places that it might show are looked for later.
 
     """
 
@@ -146,10 +147,9 @@ class BackEnd:
         self._poses[stamp_ns] = se3.orthonormalise(keyframe.T_world_camera)
         self._views[stamp_ns] = view
         self._unlooked.append(keyframe)
-        if self._hurried():
-            self._join_all(corners, list(self._views)[-_HURRIED_WINDOW - 1 : -1])
-        else:
-            self._join_all(corners, self._partners(corners))
+        hurried = self._hurried()
+        self._join_all(corners, self._partners(corners, hurried))
+        if not hurried:
             if self._config.loop.enabled:
                 self._close_loop(corners)
             self._renew()
@@ -190,9 +190,15 @@ class BackEnd:
         """Return T_other_one as it is now."""
         return se3.inverse(self._poses[other]) @ self._poses[one]
 
-    def _partners(self, corners: Corners) -> list[int]:
+    def _partners(self, corners: Corners, hurried: bool) -> list[int]:
         """Return the window, and the older keyframes that show most of the corners."""
         config = self._config.bundle
+        if hurried:
+            config = replace(
+                config,
+                window=min(config.window, _HURRIED_WINDOW),
+                older=min(config.older, _HURRIED_OLDER),
+            )
         stamp_ns = corners.view.stamp_ns
         earlier = [known for known in self._views if known != stamp_ns]
         window, older = earlier[-config.window :], earlier[: -config.window]
@@ -238,7 +244,7 @@ class BackEnd:
             self._loop.add(keyframe)
         self._unlooked.clear()
         joined = {old for new, old in self._pairs if new == stamp_ns}
-        window = list(self._views)[-self._config.bundle.window - 1 :]
+        window = list(self._views)[-_NEWEST - 1 :]
         among = [
             known
             for known in self._views
@@ -342,7 +348,7 @@ class BackEnd:
         if len(self._views) <= self._config.keyframes:
             return
         stamps = list(self._views)
-        gone, stays = _most_redundant([self._poses[s] for s in stamps], self._config.bundle.window)
+        gone, stays = _most_redundant([self._poses[s] for s in stamps])
         self._forget(stamps[gone], stamps[stays])
 
     def _forget(self, gone: int, leader: int) -> None:
@@ -366,9 +372,9 @@ def _are_near(T: Pose) -> bool:
     return bool(np.linalg.norm(T[:3, 3]) < _NEAR_M and se3.rotation_angle_rad(T) < _NEAR_RAD)
 
 
-def _most_redundant(poses: Sequence[Pose], window: int) -> tuple[int, int]:
-    """Return which keyframe is nearest to another, and to which; not the first, not the window."""
+def _most_redundant(poses: Sequence[Pose]) -> tuple[int, int]:
+    """Return which keyframe is nearest to another, and to which; not the first or a new one."""
     distance = se3.view_distances(poses, _METRES_PER_RADIAN)
-    nearest = distance[1:-window].min(axis=1)
+    nearest = distance[1:-_NEWEST].min(axis=1)
     gone = 1 + int(np.argmin(nearest))
     return gone, int(np.argmin(distance[gone]))

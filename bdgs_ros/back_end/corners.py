@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 
 _SMALL = 0.5  # scale of depth and mask as they are kept
 _WINDOW_PX = 15
+_SETTLED = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.03)  # rounds, px
 _LEVELS = 1  # of the pyramid above the image: the start is good to a few pixels
 _APART_PX = 14  # corners of one image
 _QUALITY = 0.01  # of the best corner
@@ -208,6 +209,7 @@ def _track(
         np.ascontiguousarray(start, np.float32).reshape(-1, 1, 2),
         winSize=(_WINDOW_PX, _WINDOW_PX),
         maxLevel=_LEVELS,
+        criteria=_SETTLED,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )
     return np.asarray(found.reshape(-1, 2), np.float32), np.asarray(status.ravel() > 0)

@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 _ROUNDS = 10
-_SETTLED = 1e-4  # m and rad
+_SETTLED = 3e-4  # m and rad
 _TOLERANCE = 9.0  # medians of the pairs' errors beyond which a pair counts less
 _NARROWER = 10.0  # what is tolerated, from round to round
 _WIDEST = 1e6  # at first; a pair further off than that, some metres, pulls no harder for it
@@ -297,7 +297,7 @@ def _apart(world: Array, pairs: _Pairs) -> Array:
     """Return xi of `T_other_one = exp(xi) @ T_linearised` now, [M, 6]."""
     now = _inverses(world[pairs.other]) @ world[pairs.one]
     change = now @ _inverses(pairs.T_other_one)
-    phi = Rotation.from_matrix(change[:, :3, :3]).as_rotvec().reshape(-1, 3)
+    phi = se3.rotation_vectors(change[:, :3, :3])
     rho = change[:, :3, 3]
     half = np.maximum(0.5 * np.linalg.norm(phi, axis=1, keepdims=True), _SMALL_RAD)
     share = (1 - half / np.tan(half)) / (2 * half) ** 2  # 1/12 where the turn is small

@@ -32,11 +32,11 @@ class Shed(IntEnum):
     RENDERS = 1
     """Views of the map for people."""
     ITERATIONS = 2
-    """Most iterations of the map at the finest level."""
+    """Most iterations of the map."""
     LABELS = 3
     """Half of the detector's images."""
     PAIRS = 4
-    """All pairs of the back end but those of neighbours; the others are joined later."""
+    """All but a few pairs of the back end; places are looked for later."""
     KEYFRAMES = 5
     """Every other keyframe."""
 

@@ -146,8 +146,8 @@ class MappingNodeConfig(GraphConfig):
         2, 'keyframes that may wait for the map; older ones only move (realtime)', low=1, high=1000
     )
     frame_buffer: int = param(60, 'frames kept until their keyframe arrives', low=2, high=10000)
-    back_end_nice: int = param(5, 'how much the back end gives way to tracking', low=0, high=19)
-    mapping_nice: int = param(10, 'how much mapping gives way to tracking', low=0, high=19)
+    back_end_nice: int = param(0, 'how much the back end gives way to tracking', low=0, high=19)
+    mapping_nice: int = param(5, 'how much mapping gives way to tracking', low=0, high=19)
     mapping: MappingConfig = field(default_factory=MappingConfig)
     belief: BeliefConfig = field(default_factory=BeliefConfig)
     back_end: BackEndConfig = field(default_factory=BackEndConfig)

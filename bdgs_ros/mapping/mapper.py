@@ -137,11 +137,12 @@ class Mapper:
         if not self._config.enabled:
             return None
         fine = shrink(keyframe, self._config.width)
+        small = shrink(fine, self._config.growth_width)
         if self.frozen:
-            return self.view(fine.frame.stamp_ns, fine.T_world_camera, fine.frame.camera)
-        fine, small = self._straighten(fine, shrink(fine, self._config.growth_width))
-        agree = self._infer(small)
-        static = self._look(small, agree)
+            return self.view(small.frame.stamp_ns, small.T_world_camera, small.frame.camera)
+        fine, small = self._straighten(fine, small)
+        agree, gone = self._infer(small)
+        static = self._look(small, agree, gone)
         in_front = self._in_front(small, static)
         level = self._growth_level(small, in_front)
         current = self._remember(fine, level.static)
@@ -151,17 +152,16 @@ class Mapper:
         for companion in companions:
             self.depth_bend.renew(companion)
         if early is not None:
-            early(self._answer(current))
+            early(self._answer(current, level.camera))
         self._optimiser.run(self.map, current, companions)
         self._thin()
         if early is not None and self._hurried():
             return None
-        return self._answer(current)
+        return self._answer(current, level.camera)
 
-    def _answer(self, current: MapKeyframe) -> ModelView:
+    def _answer(self, current: MapKeyframe, camera: PinholeCamera) -> ModelView:
         """Render what tracking gets."""
-        pose, camera = current.T_world_camera, current.levels[0].camera
-        return self.view(current.stamp_ns, pose, camera, current.exposure)
+        return self.view(current.stamp_ns, current.T_world_camera, camera, current.exposure)
 
     def _straighten(self, fine: Keyframe, small: Keyframe) -> tuple[Keyframe, Keyframe]:
         """Learn the bend of the depth sensor, and take out of the depth what is known of it."""
@@ -203,11 +203,11 @@ class Mapper:
             backend=self._config.backend,
         )
 
-    def _infer(self, keyframe: Keyframe) -> Mask:
+    def _infer(self, keyframe: Keyframe) -> tuple[Mask, Mask]:
         """
-        Update every belief with what this keyframe says, Eq. 1-6, 10; delete what is gone.
+        Update every belief with what this keyframe says, Eq. 1-6, 10.
 
-        Returns where the camera measured the depth of a Gaussian that is still there, [N].
+        Returns where the camera measured a Gaussian's depth, and which Gaussians are gone, [N].
         """
         frame = keyframe.frame
         observation = Observation(
@@ -223,18 +223,17 @@ class Mapper:
         gone = prune.confirmed_gone(self.map, self._belief)
         gone |= prune.unconfirmed(self.map, self._count, self._config.prune)
         self.removed_by_belief = self.map.serial[gone]
-        self.map.keep(~gone)
-        return np.asarray(features.agrees[~gone])
+        return features.agrees, gone
 
-    def _look(self, keyframe: Keyframe, agree: Mask) -> Rendered:
-        """Render the static map as a keyframe finds it; what adds nothing to such views goes."""
+    def _look(self, keyframe: Keyframe, agree: Mask, gone: Mask) -> Rendered:
+        """Render the static map as a keyframe finds it; what is gone, or adds nothing, goes."""
         T, camera = keyframe.T_world_camera, keyframe.frame.camera
-        static = self._render(T, camera, self.map.visible_mask(), statistics=True)
+        static = self._render(T, camera, self.map.visible_mask() & ~gone, statistics=True)
         assert static.max_weight is not None
         resolved = prune.resolved_by(self.map, se3.inverse(T), camera)
         config = self._config.prune
         prune.note_contribution(self.map, agree, static.max_weight, resolved, config)
-        self.map.keep(~prune.redundant(self.map, config))
+        self.map.keep(~(gone | prune.redundant(self.map, config)))
         return static
 
     def _in_map_colors(self, frame: RgbdFrame) -> NDArray[np.float32]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,8 +40,7 @@ class Optimiser:
     config : MappingConfig
         Steps and rates.
     hurried : callable
-        Whether the next keyframe waits already: then the finest level gets
-        `config.hurried_fine` iterations.
+        Whether the next keyframe waits already: then there are `config.hurried` iterations.
 
     """
 
@@ -99,15 +98,22 @@ class Optimiser:
             calm = (1 - done / self._config.iterations) ** 2
             return self._step(gaussians, *view, visible, penalised, pose_scale=calm)
 
-        losses = [step(done, view) for done, view in enumerate(coarse)]
-        seen = [loss for (kf, level), loss in zip(coarse, losses, strict=True) if kf is newest]
+        losses: list[float] = []
+        for view in self._until_hurried(coarse, 0):
+            losses.append(step(len(losses), view))
+        seen = [loss for (kf, _), loss in zip(coarse, losses, strict=False) if kf is newest]
         if _gain(seen[len(seen) // 2 :]) < self._config.enough:
             fine = fine[: self._config.min_fine]
-        for count, view in enumerate(fine):
-            if count >= self._config.hurried_fine and self._hurried():
-                break
-            losses.append(step(len(coarse) + count, view))
+        for view in self._until_hurried(fine, len(losses)):
+            losses.append(step(len(losses), view))
         return losses
+
+    def _until_hurried(self, plan: Plan, done: int) -> Iterator[tuple[MapKeyframe, int]]:
+        """Yield from a plan, and end where enough is done for as long as a keyframe waits."""
+        for count, view in enumerate(plan, done):
+            if count >= self._config.hurried and self._hurried():
+                return
+            yield view
 
     def step(
         self,

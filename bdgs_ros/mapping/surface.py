@@ -58,46 +58,51 @@ def fit_surface(
     """
     usable = usable & (depth_m > 0)
     measured = np.where(usable, 1 / np.maximum(depth_m, 1e-3), 0).astype(np.float32)
-    normals = np.zeros((*depth_m.shape, 3), np.float32)
+    normal = [np.zeros(depth_m.shape, np.float32) for _ in range(3)]
     inverse_depth = measured.copy()
     flat = np.zeros(depth_m.shape, bool)
     limit = tolerance * measured**2  # d(1/z) = dz / z^2
     for radius in sorted({max(1, largest >> i) for i in range(3)}, reverse=True):
-        plane, rms, share = _fit_window(measured, usable, camera, radius)
+        plane, at_pixel, rms, share = _fit_window(measured, usable, camera, radius)
         fits = usable & ~flat & (share >= _MIN_SHARE) & (rms < limit)
-        at_pixel = np.einsum('hwi,hwi->hw', plane, camera.rays())
         fits &= np.abs(at_pixel - measured) < 2 * limit
-        normals[fits] = -plane[fits]
-        inverse_depth[fits] = at_pixel[fits]
+        for axis, coefficient in zip(normal, plane, strict=True):
+            np.negative(coefficient, out=axis, where=fits)
+        np.copyto(inverse_depth, at_pixel, where=fits)
         flat |= fits
-    length = np.linalg.norm(normals, axis=2, keepdims=True)
-    return Surface(normals / np.maximum(length, 1e-12), inverse_depth, flat)
+    x, y, z = normal
+    once = np.reciprocal(np.maximum(np.sqrt(x * x + y * y + z * z), np.float32(1e-12)))
+    return Surface(cv2.merge([x * once, y * once, z * once]), inverse_depth, flat)
 
 
 def _fit_window(
     inverse_depth: Array, usable: Mask, camera: PinholeCamera, radius: int
-) -> tuple[Array, Array, Array]:
+) -> tuple[tuple[Array, Array, Array], Array, Array, Array]:
     """
     Fit 1/z = p.(x, y, 1) around every pixel.
 
-    Returns p, shape (H, W, 3), the root mean square residual in 1/m, shape (H, W), and the share
-    of the window that took part.
+    Returns, each of shape (H, W): the three of p; 1/z of the plane at the pixel; the root mean
+    square residual in 1/m; the share of the window that took part.
     """
-    x, y = camera.rays()[..., 0], camera.rays()[..., 1]
+    x, y = (np.asarray(plane, np.float32) for plane in cv2.split(camera.rays())[:2])
     w, q = usable.astype(np.float32), inverse_depth
     wx, wy, wq = w * x, w * y, w * q
     terms = (w, wx, wy, wq, wx * x, wx * y, wy * y, wq * x, wq * y, wq * q)
     size = (2 * radius + 1, 2 * radius + 1)
-    sums = [cv2.boxFilter(a, -1, size, borderType=cv2.BORDER_CONSTANT) for a in terms]
-    share = np.asarray(sums[0], np.float32)
-    once = 1 / np.maximum(share, np.float32(1e-6))
+    sums = [
+        np.asarray(cv2.boxFilter(a, -1, size, borderType=cv2.BORDER_CONSTANT), np.float32)
+        for a in terms
+    ]
+    share = sums[0]
+    once = np.reciprocal(np.maximum(share, np.float32(1e-6)))
     mx, my, mq, mxx, mxy, myy, mqx, mqy, mqq = (a * once for a in sums[1:])
     sxx, sxy, syy = mxx - mx * mx, mxy - mx * my, myy - my * my
     sqx, sqy, sqq = mqx - mq * mx, mqy - mq * my, mqq - mq * mq
     # A full window has this variance along each axis; far less means one direction is unseen.
     spread = radius * (radius + 1) / (3 * camera.fx**2)
-    once = 1 / np.maximum(sxx * syy - sxy * sxy, np.float32((0.05 * spread) ** 2))
+    once = np.reciprocal(np.maximum(sxx * syy - sxy * sxy, np.float32((0.05 * spread) ** 2)))
     a = (syy * sqx - sxy * sqy) * once
     b = (sxx * sqy - sxy * sqx) * once
+    c = mq - a * mx - b * my
     residual = np.sqrt(np.maximum(sqq - a * sqx - b * sqy, 0))
-    return np.stack([a, b, mq - a * mx - b * my], axis=2), residual, share
+    return (a, b, c), a * x + b * y + c, residual, share

@@ -11,7 +11,7 @@ al., "A photometrically calibrated benchmark for monocular visual odometry", 201
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Protocol
 
 import cv2
@@ -28,7 +28,7 @@ _ROUNDS = 4  # of reweighting
 _TOLERANCE = 0.05  # of log brightness: differences beyond count less
 _SAME_SURFACE = 0.03  # of the depth
 _DARK, _SATURATED = 0.05, 0.95  # outside, the sensor does not answer in proportion
-_MIN_PIXELS, _MAX_PIXELS = 300, 10000
+_MIN_PIXELS, _MAX_PIXELS = 300, 4000
 _PRIOR = 0.1  # information that there is no falloff
 _KNOWN = 100.0  # information in a falloff that an earlier run found
 _BRIGHTEST, _DARKEST = 0.1, -1.2  # of log falloff: no lens does more
@@ -109,6 +109,13 @@ class Photo:
             T_world_camera,
         )
 
+    @cached_property
+    def samples(self) -> tuple[NDArray[np.int64], Array]:
+        """Some usable pixels (v, u), [n, 2], and their points in the camera's frame, [n, 3]."""
+        chosen = np.flatnonzero(self.usable)
+        at = np.unravel_index(chosen[:: 1 + len(chosen) // _MAX_PIXELS], self.usable.shape)
+        return np.stack(at, axis=1), self.depth_m[at][:, None] * self.camera.rays()[at]
+
 
 @lru_cache(maxsize=16)
 def _falloff(camera: PinholeCamera, coefficients: tuple[float, float]) -> Array:
@@ -158,12 +165,9 @@ def _compare(one: Photo, other: Photo) -> tuple[Matrix, Matrix] | None:
 
 def _correspondences(one: Photo, other: Photo) -> tuple[Matrix, NDArray[np.int64]]:
     """Return where pixels of `one` lie in `other`, [n, 2] (u, v), and which they are (v, u)."""
-    index = np.argwhere(one.usable)
-    index = index[:: 1 + len(index) // _MAX_PIXELS]
+    index, points_one = one.samples
     T_other_one = np.linalg.inv(other.T_world_camera) @ one.T_world_camera
-    at = tuple(index.T)
-    points = one.depth_m[at][:, None] * one.camera.rays()[at] @ T_other_one[:3, :3].T
-    points = points + T_other_one[:3, 3]
+    points = points_one @ T_other_one[:3, :3].T + T_other_one[:3, 3]
     front = points[:, 2] > 0.1
     points, index = points[front], index[front]
     pixel = other.camera.project(points)

@@ -14,11 +14,10 @@ from std_msgs.msg import Empty
 
 from bdgs_ros.bridge import conversions, optional, parameters, topics
 from bdgs_ros.bridge.frames import FrameDecoder, FrameSource, RawFrame
-from bdgs_ros.bridge.governor import Shed
 from bdgs_ros.bridge.health import Health
 from bdgs_ros.bridge.load import hear_load
 from bdgs_ros.bridge.node_config import DetectionNodeConfig
-from bdgs_ros.bridge.pace import Pace
+from bdgs_ros.bridge.pace import LabelsPace
 from bdgs_ros.bridge.runner import GraphNode, run
 from bdgs_ros.bridge.worker import Worker
 from bdgs_ros.core.errors import DatasetError
@@ -27,7 +26,6 @@ from bdgs_ros.detection.late import AtOnce, InBackground
 from bdgs_ros.detection.stage import DetectionStage
 
 _QUEUE = 1  # images that may wait for their labels in real time: the newest is of most use
-_SHED_RATE = 0.5  # of the labels, when tracking is behind
 
 
 class DetectionNode(GraphNode):
@@ -53,9 +51,8 @@ class DetectionNode(GraphNode):
             None if config.lockstep else _QUEUE,
             nice=config.detection_nice,
         )
-        self._rate_hz = math.inf if config.lockstep else config.labels_rate
-        self._pace = Pace(self._rate_hz)
-        hear_load(self, self._on_load)
+        self._pace = LabelsPace(math.inf if config.lockstep else config.labels_rate)
+        hear_load(self, self._pace.note_load)
         self._source = FrameSource(self, config, self._health, self._on_pair, self._reset)
         self.create_subscription(
             Empty, topics.RESET_EVENT, lambda _: self._reset(), topics.RELIABLE
@@ -65,9 +62,6 @@ class DetectionNode(GraphNode):
     def _on_pair(self, raw: RawFrame) -> None:
         if self._pace.is_due(raw.stamp_ns):
             self._worker.put(raw)
-
-    def _on_load(self, level: Shed) -> None:
-        self._pace.set_rate(self._rate_hz * (_SHED_RATE if level >= Shed.LABELS else 1.0))
 
     def _on_frame(self, raw: RawFrame) -> None:
         try:
@@ -83,6 +77,7 @@ class DetectionNode(GraphNode):
             self._health.error(error)
             labels = Labels(raw.stamp_ns, np.zeros(frame.camera.shape, np.uint8))
         self._note_answers(raw.stamp_ns)
+        self._pace.note_labels(bool(labels.p_dynamic.any()))
         weights = self._stage.status if self._stage.degraded else ''
         self._health.set_problem('detector', weights)
         self._publish(labels, raw)

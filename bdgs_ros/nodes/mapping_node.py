@@ -199,6 +199,8 @@ class MappingNode(GraphNode):
 
     def _map(self, keyframe: Keyframe, adjustment: Adjustment) -> None:
         answered = False
+        if not self._config.lockstep:  # better ones may have come since the back end had it
+            keyframe = replace(keyframe, p_dynamic=self._labels_of(keyframe.frame, _LABELS_WAIT_S))
         try:
             with self._health.timed('mapping'), self._lock:
                 answered = self._back_end.into_map(keyframe, adjustment)
@@ -256,28 +258,29 @@ class MappingNode(GraphNode):
             return None
         frame = self._decoder.decode(raw)
         self._output.see_through(frame.camera, raw.color.header.frame_id)
-        labels = self._labels_of(frame)
+        labels = self._labels_of(frame, 0.0)
         return Keyframe(frame, conversions.pose_from_message(message.pose), labels)
 
-    def _labels_of(self, frame: RgbdFrame) -> ProbabilityImage:
-        """Return the labels of a frame; in real time the nearest ones will do."""
+    def _labels_of(self, frame: RgbdFrame, wait_s: float) -> ProbabilityImage:
+        """Return the labels of a frame; in real time the nearest ones will do, after a wait."""
         if self._mapper.frozen:  # they would change nothing
             return np.zeros(frame.camera.shape, np.uint8)
-        message = self._find_labels(frame.stamp_ns)
+        message = self._find_labels(frame.stamp_ns, wait_s)
+        lockstep = self._config.lockstep
         if message is None:
-            self._health.counts['keyframes_without_labels'] += 1
+            # the back end asks without waiting, and the map once more
+            self._health.counts['keyframes_without_labels'] += bool(wait_s) or lockstep
             return np.zeros(frame.camera.shape, np.uint8)
         return conversions.probability_from_message(message, topics.LABELS)
 
-    def _find_labels(self, stamp_ns: int) -> CdrImage | None:
+    def _find_labels(self, stamp_ns: int, wait_s: float) -> CdrImage | None:
         """Find labels: detection passes images over in real time, so newer ones end the wait."""
         present = self.count_publishers(topics.LABELS) > 0
         if self._config.lockstep and present:
             found = self._labels.wait(stamp_ns, self._config.lockstep_timeout_s)
             if found is not None:
                 return found
-        wait_s = _LABELS_WAIT_S if present and not self._config.lockstep else 0.0
-        return self._labels.nearest(stamp_ns, _MAX_LABEL_AGE_NS, wait_s)
+        return self._labels.nearest(stamp_ns, _MAX_LABEL_AGE_NS, wait_s if present else 0.0)
 
     def _on_idle(self) -> None:
         """Between keyframes: show the map, and save it if that is due."""

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from bdgs_ros.bridge.acknowledgements import Acknowledgements
-from bdgs_ros.bridge.pace import Pace
+from bdgs_ros.bridge.governor import Shed
+from bdgs_ros.bridge.pace import LabelsPace, Pace
 from bdgs_ros.bridge.priority import leave_one
 from bdgs_ros.bridge.stamped import Assembler, StampBuffer
 from bdgs_ros.bridge.worker import Worker
@@ -178,6 +179,27 @@ def test_a_pace_goes_on_after_a_gap() -> None:
     assert not pace.is_due(5_020_000_000)
     pace.reset()
     assert pace.is_due(0)
+
+
+def test_half_of_the_labels_are_made_under_load_and_where_nobody_is() -> None:
+    pace, stamp_ns = LabelsPace(10), 0
+
+    def per_second() -> int:
+        nonlocal stamp_ns
+        stamps = [stamp_ns + i * 33_333_333 for i in range(30)]
+        stamp_ns = stamps[-1] + 33_333_333
+        return sum(pace.is_due(stamp) for stamp in stamps)
+
+    assert per_second() == 10
+    for _ in range(10):
+        pace.note_labels(show_anybody=False)
+    assert per_second() == pytest.approx(5, abs=1)
+    pace.note_labels(show_anybody=True)
+    assert per_second() == pytest.approx(10, abs=1)
+    pace.note_load(Shed.LABELS)
+    assert per_second() == pytest.approx(5, abs=1)
+    pace.note_load(Shed.NOTHING)
+    assert per_second() == pytest.approx(10, abs=1)
 
 
 def test_signals_are_counted_without_a_lock() -> None:

@@ -7,7 +7,7 @@ from bdgs_ros.core import se3
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.config import MappingConfig
 from bdgs_ros.core.types import Keyframe, RgbdFrame
-from bdgs_ros.mapping import growth
+from bdgs_ros.mapping import growth, keyframes
 from bdgs_ros.mapping.keyframes import MapKeyframe, build_levels, most_redundant, shrink
 
 CAMERA = PinholeCamera(64, 48, 60.0, 60.0, 31.5, 23.5)
@@ -64,3 +64,11 @@ def test_the_keyframe_that_another_stands_in_for_is_forgotten_first() -> None:
     for kf, x in zip(kept, (0.0, 1.0, 1.05, 3.0), strict=True):
         kf.T_world_camera = se3.exp(np.array([x, 0, 0, 0, 0, 0]))
     assert most_redundant(kept) in kept[1:3]
+
+
+def test_the_fast_median_of_four_is_the_lower_median_of_what_is_valid() -> None:
+    blocks = np.random.default_rng(0).uniform(0.5, 6, (4, 40, 50)).astype(np.float32)
+    blocks[np.random.default_rng(1).random(blocks.shape) < 0.4] = 0
+    expected = keyframes._lower_median(blocks)
+    assert (np.count_nonzero(blocks, axis=0) == 0).any()
+    np.testing.assert_array_equal(keyframes._lower_median_of_four(blocks), expected)

@@ -108,3 +108,11 @@ def test_hats_are_cross_products() -> None:
     for hat, vector in zip(se3.hats(vectors), vectors, strict=True):
         assert (hat == se3.hat(vector)).all()
         assert hat @ [1.0, 2.0, 3.0] == pytest.approx(np.cross(vector, [1.0, 2.0, 3.0]))
+
+
+def test_many_rotation_vectors_are_those_of_each() -> None:
+    phi = np.array([[0, 0, 0], [1e-9, 0, 0], [0.3, -0.2, 0.1], [0, 2.9, 0.4], [0, 0, np.pi]])
+    rotations = np.array([se3.exp(np.append(np.zeros(3), each))[:3, :3] for each in phi])
+    found = se3.rotation_vectors(rotations)
+    np.testing.assert_allclose(np.abs(found), np.abs(phi), atol=1e-9)
+    np.testing.assert_allclose(found[:4], phi[:4], atol=1e-9)

@@ -153,7 +153,10 @@ class MappingConfig:
     enabled: bool = param(True, 'without it tracking is keyframe odometry (Table 6)')
     width: int = param(640, 'image width at which the map is optimised', unit='px', low=40)
     growth_width: int = param(
-        320, 'image width at which beliefs are updated and Gaussians added', unit='px', low=40
+        320,
+        'image width at which beliefs are updated, Gaussians added, tracking answered',
+        unit='px',
+        low=40,
     )
     step_pixels: int = param(
         153600, 'of a larger image, one step sees a window of this many', unit='px', low=400
@@ -165,8 +168,8 @@ class MappingConfig:
     min_fine: int = param(
         16, 'iterations at the finest level where the residual says enough', low=0, high=1000
     )
-    hurried_fine: int = param(
-        0, 'iterations there while the next keyframe waits (realtime)', low=0, high=1000
+    hurried: int = param(
+        4, 'iterations while the next keyframe waits (realtime)', low=0, high=1000
     )
     window: int = param(8, 'newest keyframes in every optimisation', low=1, high=64)
     keyframes: int = param(
