@@ -13,6 +13,7 @@ from bdgs_ros.back_end.back_end import BackEnd
 from bdgs_ros.core import se3
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.config import BdgsConfig
+from bdgs_ros.core.images import fitted, halved
 from bdgs_ros.core.types import (
     Keyframe,
     Labels,
@@ -58,7 +59,7 @@ class BdgsSlam:
         self.tracker = CameraTracker(config.tracking)
         self.mapper = Mapper(config.mapping, config.belief)
         self.back_end = BackEnd(config.back_end)
-        self._map_width = config.mapping.width
+        self._width, self._map_width = config.camera.width, config.mapping.width
 
     def start_from(
         self,
@@ -105,12 +106,14 @@ class BdgsSlam:
         moved = self.tracker.take_move()
         if moved is not None:
             self.mapper.history.note_move(frame.stamp_ns, moved)
-        tracking = self.tracker.process(frame, labels)
+        frame = halved(frame, self._width)
+        fitting = fitted(labels, frame)
+        tracking = self.tracker.process(frame, fitting)
         self.tracker.rest()
         if tracking.status is TrackingStatus.OK:
             self.back_end.observe(frame.stamp_ns, tracking.T_world_camera)
         if tracking.is_keyframe:
-            keyframe = Keyframe(frame, tracking.T_world_camera, labels.p_dynamic)
+            keyframe = Keyframe(frame, tracking.T_world_camera, fitting.p_dynamic)
             self.tracker.set_model(take_keyframe(self.back_end, self.mapper, keyframe))
             self.tracker.note_keyframes(self.mapper.keyframe_poses())
         return FrameResult(labels, tracking)

@@ -23,6 +23,9 @@ _CALM_S = 2.0  # without pressure before a step is given back
 _PRESSED, _PRESSED_S = 1.5, 0.04  # periods and s from image to pose, 90th percentile: too many
 _AT_EASE, _AT_EASE_S = 1.0, 0.03  # there is room
 _LATE = 2.0  # periods that a frame may wait while newer ones are there
+_COSTS = 30  # frames that tell what one costs
+_FULL, _ROOM = 0.8, 0.35  # of the period: a frame costs too much, or could cost twice as much
+_COARSEST = 2  # pyramid levels that may be left out
 
 
 class Shed(IntEnum):
@@ -58,6 +61,9 @@ class Governor:
         self.level = Shed.NOTHING
         self.reason = ''
         """Why the level is not zero, with numbers."""
+        self.coarser = 0
+        """How many of its finest pyramid levels tracking leaves out, or it could not keep up."""
+        self._costs_s: deque[float] = deque(maxlen=_COSTS)
         self._arrivals: deque[float] = deque(maxlen=_INTERVALS)
         self._ages_s: deque[float] = deque(maxlen=_POSES)  # of images when their poses came
         self._passed_over = 0  # since they were last looked at
@@ -94,6 +100,21 @@ class Governor:
         if pressure:
             self._pressed_s = now_s
         return self._step(pressure, now_s)
+
+    def note_cost(self, processor_s: float) -> None:
+        """
+        Note what a frame took of tracking's processor; choose the resolution that it works at.
+
+        No other process is to blame for that, so nothing else that is left out would help.
+        """
+        self._costs_s.append(processor_s)
+        if len(self._costs_s) < _COSTS or len(self._arrivals) < _INTERVALS:
+            return
+        share = float(np.median(self._costs_s)) / self.period_s
+        wanted = self.coarser + (share > _FULL) - (share < _ROOM)
+        if self.coarser != (wanted := min(max(wanted, 0), _COARSEST)):
+            self.coarser = wanted
+            self._costs_s.clear()
 
     def _pressure(self) -> str:
         """Say why something must be left out; nothing where poses are in time."""

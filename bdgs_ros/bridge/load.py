@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 from rclpy.node import Node
 from std_msgs.msg import UInt8
@@ -39,6 +40,20 @@ class LoadWatch:
     def level(self) -> Shed:
         """What is left out now."""
         return self._governor.level
+
+    @property
+    def coarser(self) -> int:
+        """How many of its finest pyramid levels tracking is to leave out."""
+        return self._governor.coarser
+
+    @contextmanager
+    def one_frame(self) -> Iterator[None]:
+        """Measure what the calling thread does for a frame."""
+        started_s = time.thread_time()
+        yield
+        if self._enabled:
+            self._governor.note_cost(time.thread_time() - started_s)
+            self._health.counts['levels_left_out'] = self._governor.coarser
 
     def note_arrival(self, raw: RawFrame) -> None:
         """Note that a frame has come."""

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from bdgs_ros.core.config import (
     BackEndConfig,
     BeliefConfig,
+    CameraConfig,
     DetectionConfig,
     MappingConfig,
     TrackingConfig,
@@ -65,6 +66,7 @@ class GraphConfig:
     localization: bool = param(
         False, 'begin in the map of map_file and leave it as it is: localisation alone'
     )
+    camera: CameraConfig = field(default_factory=CameraConfig)
     qos: QosConfig = field(default_factory=QosConfig)
     sync: SyncConfig = field(default_factory=SyncConfig)
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from bdgs_ros.core import se3
 from bdgs_ros.core.camera import PinholeCamera
+from bdgs_ros.core.images import sample_depth, shrink_frame, shrink_labels
 from bdgs_ros.core.types import (
     DYNAMIC_THRESHOLD,
     ColorImage,
@@ -23,8 +24,6 @@ from bdgs_ros.core.types import (
 from bdgs_ros.mapping.vignette import Vignette
 
 Array = NDArray[np.float32]
-
-_SAME_SURFACE = 0.03  # of the depth: larger steps between neighbours are edges
 
 
 @dataclass(frozen=True)
@@ -126,61 +125,11 @@ def shrink(keyframe: Keyframe, width: int) -> Keyframe:
     A depth that is the average of two surfaces lies on neither, so depths are averaged within
     one; a dynamic pixel must not get lost, so probabilities take the maximum.
     """
-    frame = keyframe.frame
-    if frame.camera.width <= width:
+    if keyframe.frame.camera.width <= width:
         return keyframe
-    camera = frame.camera.scaled(width / frame.camera.width)
-    size = (camera.width, camera.height)
-    color = cv2.resize(frame.color, size, interpolation=cv2.INTER_AREA)
-    depth_m = _sample_depth(frame.depth_m, camera.shape)
-    ratio = max(1, round(frame.camera.width / width))
-    spread = cv2.dilate(keyframe.p_dynamic, np.ones((ratio, ratio), np.uint8))
-    p_dynamic = cv2.resize(spread, size, interpolation=cv2.INTER_NEAREST)
-    small = type(frame)(frame.stamp_ns, np.asarray(color, np.uint8), depth_m, camera)
-    return Keyframe(small, keyframe.T_world_camera, np.asarray(p_dynamic, np.uint8))
-
-
-def _sample_depth(depth_m: DepthImage, shape: tuple[int, int]) -> DepthImage:
-    """
-    Shrink a depth image without mixing surfaces and without bias.
-
-    Each block gives the mean of its valid depths that lie on the surface of their lower median.
-    A single one of them would do for edges, but is off by half a pixel on slanted surfaces.
-    """
-    blocks = _blocks(depth_m, shape)
-    median = _lower_median(blocks) if len(blocks) != 4 else _lower_median_of_four(blocks)
-    same = (blocks > 0) & (np.abs(blocks - median) <= _SAME_SURFACE * median)
-    count = np.maximum(np.count_nonzero(same, axis=0), 1)
-    return np.asarray((blocks * same).sum(axis=0) / count, np.float32)
-
-
-def _lower_median(blocks: DepthImage) -> DepthImage:
-    """Return the lower median of the valid depths of each block, [B, H, W] to [H, W]."""
-    ordered = np.sort(blocks, axis=0)
-    valid = np.count_nonzero(blocks, axis=0)
-    middle = len(blocks) - valid + np.maximum(valid - 1, 0) // 2
-    rank = np.minimum(middle, len(blocks) - 1)[None]
-    return np.asarray(np.take_along_axis(ordered, rank, 0)[0])
-
-
-def _lower_median_of_four(blocks: DepthImage) -> DepthImage:
-    """Do as `_lower_median` with the five comparisons that sort four numbers: ten times faster."""
-    a, b, c, d = blocks
-    low, high = np.minimum(a, b), np.maximum(a, b)
-    low2, high2 = np.minimum(c, d), np.maximum(c, d)
-    least, most = np.minimum(low, low2), np.maximum(high, high2)
-    inner = np.maximum(low, low2), np.minimum(high, high2)
-    second, third = np.minimum(*inner), np.maximum(*inner)
-    return np.asarray(np.where(least > 0, second, np.where(third > 0, third, most)))
-
-
-def _blocks(depth_m: DepthImage, shape: tuple[int, int]) -> DepthImage:
-    """Return the pixels that fall into each pixel of the smaller image, [B, H, W]."""
-    rows = depth_m.shape[0] // shape[0]
-    columns = depth_m.shape[1] // shape[1]
-    blocks = depth_m[: shape[0] * rows, : shape[1] * columns]
-    blocks = blocks.reshape(shape[0], rows, shape[1], columns).transpose(1, 3, 0, 2)
-    return blocks.reshape(rows * columns, *shape)
+    small = shrink_frame(keyframe.frame, width)
+    p_dynamic = shrink_labels(keyframe.p_dynamic, small.camera.shape)
+    return Keyframe(small, keyframe.T_world_camera, p_dynamic)
 
 
 def build_levels(
@@ -220,7 +169,7 @@ def _halve(level: Level) -> Level:
     return Level(
         camera,
         np.asarray(image, np.uint8),
-        _sample_depth(level.depth_m, camera.shape),
+        sample_depth(level.depth_m, camera.shape),
         np.asarray(weight >= 1),
         level.vignette,
     )

@@ -33,8 +33,10 @@ from bdgs_ros.bridge.stamped import StampBuffer
 from bdgs_ros.bridge.worker import Worker
 from bdgs_ros.core.config import MappingConfig
 from bdgs_ros.core.errors import BdgsError
+from bdgs_ros.core.images import fitted, halved
 from bdgs_ros.core.types import (
     Keyframe,
+    Labels,
     Pose,
     ProbabilityImage,
     RgbdFrame,
@@ -258,6 +260,7 @@ class MappingNode(GraphNode):
             return None
         frame = self._decoder.decode(raw)
         self._output.see_through(frame.camera, raw.color.header.frame_id)
+        frame = halved(frame, self._config.camera.width)
         labels = self._labels_of(frame, 0.0)
         return Keyframe(frame, conversions.pose_from_message(message.pose), labels)
 
@@ -271,7 +274,8 @@ class MappingNode(GraphNode):
             # the back end asks without waiting, and the map once more
             self._health.counts['keyframes_without_labels'] += bool(wait_s) or lockstep
             return np.zeros(frame.camera.shape, np.uint8)
-        return conversions.probability_from_message(message, topics.LABELS)
+        labels = conversions.probability_from_message(message, topics.LABELS)
+        return fitted(Labels(frame.stamp_ns, labels), frame).p_dynamic
 
     def _find_labels(self, stamp_ns: int, wait_s: float) -> CdrImage | None:
         """Find labels: detection passes images over in real time, so newer ones end the wait."""

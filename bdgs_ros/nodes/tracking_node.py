@@ -25,6 +25,7 @@ from bdgs_ros.bridge.services import serve_switch, serve_trigger
 from bdgs_ros.bridge.status import FrameState, FrameStatus, status_to_message
 from bdgs_ros.bridge.worker import Worker
 from bdgs_ros.core.errors import ConfigError, DatasetError, MapError
+from bdgs_ros.core.images import fitted, halved
 from bdgs_ros.core.types import Keyframe, RgbdFrame, TrackingResult, TrackingStatus
 from bdgs_ros.data.trajectory_io import write_trajectory
 from bdgs_ros.mapping.map_files import load_places
@@ -77,6 +78,11 @@ class TrackingNode(GraphNode):
         self._finish(raw, FrameStatus(raw.stamp_ns, FrameState.PASSED_OVER))
 
     def _on_frame(self, raw: RawFrame) -> None:
+        with self._load.one_frame():
+            self._take(raw)
+        self._tracker.coarser = self._load.coarser
+
+    def _take(self, raw: RawFrame) -> None:
         if self._feedback.map_was_replaced():
             self._start_over()
             self.get_logger().info(f"the map is now '{self._feedback.loaded_map}'")
@@ -130,6 +136,8 @@ class TrackingNode(GraphNode):
 
     def _track(self, raw: RawFrame, frame: RgbdFrame) -> None:
         labels = self._feedback.labels(frame)
+        frame = halved(frame, self._config.camera.width)
+        labels = labels and fitted(labels, frame)
         for view in self._feedback.new_models():
             self._tracker.set_model(view)
         self._tracker.note_keyframes(self._feedback.moved_keyframes())

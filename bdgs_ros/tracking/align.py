@@ -121,6 +121,7 @@ class Aligner:
         p_dynamic: ProbabilityImage | None,
         camera: PinholeCamera,
         sweep: NDArray[np.float64] | None = None,
+        coarser: int = 0,
     ) -> ImagePyramid:
         """
         Prepare an image for alignment, as reference or as current.
@@ -138,6 +139,8 @@ class Aligner:
         sweep : ndarray, shape (6,), optional
             Motion of the camera while the image was read out, (rho, phi) in its frame; None
             for a global shutter, or a camera at rest.
+        coarser : int
+            Finest levels that are left out; there is one at least.
 
         Raises
         ------
@@ -146,7 +149,7 @@ class Aligner:
 
         """
         _check_shapes(image, depth_m, p_dynamic, camera)
-        block, count = _levels(camera.width, self._config)
+        block, count = _levels(camera.width, self._config, coarser)
         handle = self._backend.build_pyramid(
             np.ascontiguousarray(image),
             np.ascontiguousarray(depth_m, dtype=np.float32),
@@ -359,14 +362,15 @@ def _check_shapes(
             )
 
 
-def _levels(width: int, config: AlignConfig) -> tuple[int, int]:
+def _levels(width: int, config: AlignConfig, coarser: int) -> tuple[int, int]:
     """Return the block of input pixels averaged for the finest level, and how many levels."""
     block = 2 ** max(0, round(np.log2(width / config.fine_width)))
     finest = width // block
     count = 1
     while finest >> count >= 0.7 * config.coarse_width:
         count += 1
-    return block, count
+    coarser = min(coarser, count - 1)
+    return block << coarser, count - coarser
 
 
 def _pair_levels(reference: tuple[int, ...], current: tuple[int, ...]) -> list[tuple[int, int]]:

@@ -67,6 +67,8 @@ class CameraTracker:
         self._motion = MotionPredictor(config.motion)
         self._movers = MoverMask(config.movers)
         self._readout_s = config.readout_s  # of the camera: outlives a reset
+        self.coarser = 0
+        """Finest pyramid levels that new frames do without; may be set between frames."""
         self.refused = 0
         """How often mapping said what cannot be."""
         self._choice = KeyframeChoice(config.keyframe)
@@ -221,7 +223,9 @@ class CameraTracker:
         prior = self._prior(frame, labels)
         expected = np.maximum(prior, self._movers.expected(frame.camera.shape))
         sweep = self._readout_s * self._motion.velocity
-        current = self._aligner.pyramid(frame.color, frame.depth_m, expected, frame.camera, sweep)
+        current = self._aligner.pyramid(
+            frame.color, frame.depth_m, expected, frame.camera, sweep, self.coarser
+        )
         if self._keyframe is None and not self._is_lost:
             return self._begin(frame, current, prior)
         self._choice.count()

@@ -56,6 +56,22 @@ def test_frames_passed_over_are_pressure_even_if_the_others_are_in_time() -> Non
     assert 'passed over' in governor.reason
 
 
+def test_tracking_works_at_the_resolution_that_its_period_allows() -> None:
+    governor = Governor()
+    full_s = 0.015  # of a processor per frame; each level less takes a third less
+
+    def play(rate_hz: float, start_s: float) -> int:
+        for i in range(round(10 * rate_hz)):
+            governor.note_arrival(start_s + i / rate_hz)
+            governor.note_cost(full_s * 0.67**governor.coarser)
+        return governor.coarser
+
+    assert play(30, 0.0) == 0
+    assert play(60, 100.0) == 1
+    assert play(120, 200.0) == 2
+    assert play(30, 300.0) == 0
+
+
 @pytest.mark.parametrize('rate_hz', [5.0, 30.0, 60.0])
 def test_a_frame_is_late_after_two_periods_of_its_camera(rate_hz: float) -> None:
     governor = Governor()

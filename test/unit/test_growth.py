@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from bdgs_ros.core import se3
+from bdgs_ros.core import images, se3
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.config import MappingConfig
-from bdgs_ros.core.types import Keyframe, RgbdFrame
-from bdgs_ros.mapping import growth, keyframes
+from bdgs_ros.core.types import Keyframe, Labels, RgbdFrame
+from bdgs_ros.mapping import growth
 from bdgs_ros.mapping.keyframes import MapKeyframe, build_levels, most_redundant, shrink
 
 CAMERA = PinholeCamera(64, 48, 60.0, 60.0, 31.5, 23.5)
@@ -69,6 +69,35 @@ def test_the_keyframe_that_another_stands_in_for_is_forgotten_first() -> None:
 def test_the_fast_median_of_four_is_the_lower_median_of_what_is_valid() -> None:
     blocks = np.random.default_rng(0).uniform(0.5, 6, (4, 40, 50)).astype(np.float32)
     blocks[np.random.default_rng(1).random(blocks.shape) < 0.4] = 0
-    expected = keyframes._lower_median(blocks)
+    expected = images._lower_median(blocks)
     assert (np.count_nonzero(blocks, axis=0) == 0).any()
-    np.testing.assert_array_equal(keyframes._lower_median_of_four(blocks), expected)
+    np.testing.assert_array_equal(images._lower_median_of_four(blocks), expected)
+
+
+@pytest.mark.parametrize(('large', 'width'), [((48, 84), 64), ((48, 84), 42), ((45, 80), 37)])
+def test_colour_and_depth_stay_on_top_of_each_other_at_any_ratio(
+    large: tuple[int, int], width: int
+) -> None:
+    x = np.arange(large[1], dtype=np.float32)[None].repeat(large[0], 0)
+    color = np.repeat((x * 2)[..., None], 3, axis=2).astype(np.uint8)
+    camera = PinholeCamera(large[1], large[0], 60.0, 60.0, large[1] / 2, large[0] / 2)
+    frame = RgbdFrame(0, color, (1 + 0.002 * x).astype(np.float32), camera)
+    small = images.shrink_frame(frame, width)
+    from_color, from_depth = small.color[..., 0] / 2, (small.depth_m - 1) / 0.002
+    assert np.abs(from_color - from_depth)[:, 1:-1].max() < 1.1
+    assert from_depth[:, -2].min() > large[1] - 2.5 * large[1] / width - 1
+
+
+def test_a_wide_frame_is_halved_but_not_below_the_width() -> None:
+    camera = PinholeCamera(256, 144, 200.0, 200.0, 128.0, 72.0)
+    frame = RgbdFrame(
+        0, np.zeros((144, 256, 3), np.uint8), np.ones((144, 256), np.float32), camera
+    )
+    p_dynamic = np.zeros((144, 256), np.uint8)
+    p_dynamic[31, 77] = 200
+    assert images.halved(frame, 129) is frame
+    small = images.halved(frame, 64)
+    assert (small.camera.width, small.camera.height) == (64, 36)
+    labels = images.fitted(Labels(0, p_dynamic), small)
+    assert labels.p_dynamic.shape == (36, 64)
+    assert labels.p_dynamic.max() == 200
