@@ -23,9 +23,9 @@ _CALM_S = 2.0  # without pressure before a step is given back
 _PRESSED, _PRESSED_S = 1.5, 0.04  # periods and s from image to pose, 90th percentile: too many
 _AT_EASE, _AT_EASE_S = 1.0, 0.03  # there is room
 _LATE = 2.0  # periods that a frame may wait while newer ones are there
-_COSTS = 30  # frames that tell what one costs
+_COSTS = 12  # frames that tell what one costs
 _FULL, _ROOM = 0.8, 0.35  # of the period: a frame costs too much, or could cost twice as much
-_COARSEST = 2  # pyramid levels that may be left out
+_FEWEST = 1 / 8  # of the points
 
 
 class Shed(IntEnum):
@@ -61,8 +61,8 @@ class Governor:
         self.level = Shed.NOTHING
         self.reason = ''
         """Why the level is not zero, with numbers."""
-        self.coarser = 0
-        """How many of its finest pyramid levels tracking leaves out, or it could not keep up."""
+        self.points_share = 1.0
+        """Share of its points that tracking compares: with all it might not keep up."""
         self._costs_s: deque[float] = deque(maxlen=_COSTS)
         self._arrivals: deque[float] = deque(maxlen=_INTERVALS)
         self._ages_s: deque[float] = deque(maxlen=_POSES)  # of images when their poses came
@@ -103,17 +103,17 @@ class Governor:
 
     def note_cost(self, processor_s: float) -> None:
         """
-        Note what a frame took of tracking's processor; choose the resolution that it works at.
+        Note what a frame took of tracking's processor; choose how closely it looks.
 
         No other process is to blame for that, so nothing else that is left out would help.
         """
         self._costs_s.append(processor_s)
-        if len(self._costs_s) < _COSTS or len(self._arrivals) < _INTERVALS:
+        if min(len(self._costs_s), len(self._arrivals)) < _COSTS:
             return
         share = float(np.median(self._costs_s)) / self.period_s
-        wanted = self.coarser + (share > _FULL) - (share < _ROOM)
-        if self.coarser != (wanted := min(max(wanted, 0), _COARSEST)):
-            self.coarser = wanted
+        wanted = self.points_share * (0.5 if share > _FULL else 2.0 if share < _ROOM else 1.0)
+        if self.points_share != (wanted := min(max(wanted, _FEWEST), 1.0)):
+            self.points_share = wanted
             self._costs_s.clear()
 
     def _pressure(self) -> str:

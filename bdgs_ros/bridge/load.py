@@ -42,9 +42,9 @@ class LoadWatch:
         return self._governor.level
 
     @property
-    def coarser(self) -> int:
-        """How many of its finest pyramid levels tracking is to leave out."""
-        return self._governor.coarser
+    def points_share(self) -> float:
+        """Share of its points that tracking is to compare."""
+        return self._governor.points_share
 
     @contextmanager
     def one_frame(self) -> Iterator[None]:
@@ -53,7 +53,8 @@ class LoadWatch:
         yield
         if self._enabled:
             self._governor.note_cost(time.thread_time() - started_s)
-            self._health.counts['levels_left_out'] = self._governor.coarser
+            share = self._governor.points_share
+            self._health.counts['points_left_out_percent'] = round(100 * (1 - share))
 
     def note_arrival(self, raw: RawFrame) -> None:
         """Note that a frame has come."""

@@ -80,7 +80,7 @@ class TrackingNode(GraphNode):
     def _on_frame(self, raw: RawFrame) -> None:
         with self._load.one_frame():
             self._take(raw)
-        self._tracker.coarser = self._load.coarser
+        self._tracker.compare(self._load.points_share)
 
     def _take(self, raw: RawFrame) -> None:
         if self._feedback.map_was_replaced():

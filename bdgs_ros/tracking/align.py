@@ -32,6 +32,7 @@ except ImportError:
 _log = logging.getLogger(__name__)
 
 _FINE_LEVELS = 2  # of a refinement
+_FEWEST_POINTS = 256  # per level
 _AT_REST = np.zeros(6)
 
 
@@ -88,7 +89,7 @@ class ResidualMaps:
 
 class Aligner:
     """
-    Coarse-to-fine Gauss-Newton on colour and inverse depth; one thread, no state.
+    Coarse-to-fine Gauss-Newton on colour and inverse depth; one thread.
 
     Parameters
     ----------
@@ -114,6 +115,10 @@ class Aligner:
         self._backend = _choose_backend(config.backend)
         self._params = _make_params(config, self._backend)
 
+    def compare(self, share: float) -> None:
+        """Compare this share of `max_points` from now on: a frame costs less, and is noisier."""
+        self._params.max_points = max(round(share * self._config.max_points), _FEWEST_POINTS)
+
     def pyramid(
         self,
         image: NDArray[np.uint8],
@@ -121,7 +126,6 @@ class Aligner:
         p_dynamic: ProbabilityImage | None,
         camera: PinholeCamera,
         sweep: NDArray[np.float64] | None = None,
-        coarser: int = 0,
     ) -> ImagePyramid:
         """
         Prepare an image for alignment, as reference or as current.
@@ -139,8 +143,6 @@ class Aligner:
         sweep : ndarray, shape (6,), optional
             Motion of the camera while the image was read out, (rho, phi) in its frame; None
             for a global shutter, or a camera at rest.
-        coarser : int
-            Finest levels that are left out; there is one at least.
 
         Raises
         ------
@@ -149,7 +151,7 @@ class Aligner:
 
         """
         _check_shapes(image, depth_m, p_dynamic, camera)
-        block, count = _levels(camera.width, self._config, coarser)
+        block, count = _levels(camera.width, self._config)
         handle = self._backend.build_pyramid(
             np.ascontiguousarray(image),
             np.ascontiguousarray(depth_m, dtype=np.float32),
@@ -362,15 +364,14 @@ def _check_shapes(
             )
 
 
-def _levels(width: int, config: AlignConfig, coarser: int) -> tuple[int, int]:
+def _levels(width: int, config: AlignConfig) -> tuple[int, int]:
     """Return the block of input pixels averaged for the finest level, and how many levels."""
     block = 2 ** max(0, round(np.log2(width / config.fine_width)))
     finest = width // block
     count = 1
     while finest >> count >= 0.7 * config.coarse_width:
         count += 1
-    coarser = min(coarser, count - 1)
-    return block << coarser, count - coarser
+    return block, count
 
 
 def _pair_levels(reference: tuple[int, ...], current: tuple[int, ...]) -> list[tuple[int, int]]:

@@ -67,8 +67,6 @@ class CameraTracker:
         self._motion = MotionPredictor(config.motion)
         self._movers = MoverMask(config.movers)
         self._readout_s = config.readout_s  # of the camera: outlives a reset
-        self.coarser = 0
-        """Finest pyramid levels that new frames do without; may be set between frames."""
         self.refused = 0
         """How often mapping said what cannot be."""
         self._choice = KeyframeChoice(config.keyframe)
@@ -223,9 +221,7 @@ class CameraTracker:
         prior = self._prior(frame, labels)
         expected = np.maximum(prior, self._movers.expected(frame.camera.shape))
         sweep = self._readout_s * self._motion.velocity
-        current = self._aligner.pyramid(
-            frame.color, frame.depth_m, expected, frame.camera, sweep, self.coarser
-        )
+        current = self._aligner.pyramid(frame.color, frame.depth_m, expected, frame.camera, sweep)
         if self._keyframe is None and not self._is_lost:
             return self._begin(frame, current, prior)
         self._choice.count()
@@ -241,6 +237,11 @@ class CameraTracker:
         if self._loss.objection(attempt.best.quality):
             return self._lose(frame, first)
         return self._conclude(frame, attempt)
+
+    def compare(self, share: float) -> None:
+        """Compare this share of the points of `tracking.align.max_points` from now on."""
+        for aligner in (self._aligner, self._refiner):
+            aligner.compare(share)
 
     def rest(self) -> None:
         """Do what can wait until the pose is out; call it after each frame, when there is time."""

@@ -275,6 +275,23 @@ def noisy() -> tuple[Image, Image, np.ndarray]:
     return images[0], images[1], mask
 
 
+@pytest.mark.parametrize('backend', BACKENDS)
+def test_with_fewer_points_the_motion_is_found_as_well(backend: str) -> None:
+    aligner = Aligner(AlignConfig(backend=backend))
+    grey_a, depth_a = picture(np.zeros(6))
+    grey_b, depth_b = picture(MOTION)
+    reference = aligner.pyramid(grey_a, depth_a, None, CAMERA)
+    current = aligner.pyramid(grey_b, depth_b, None, CAMERA)
+    exact = se3.inverse(se3.exp(MOTION))
+    errors = []
+    for share in (1.0, 0.25, 1.0):
+        aligner.compare(share)
+        found = aligner.align(reference, current, np.eye(4)).T_current_reference
+        errors.append(np.linalg.norm(se3.log(found @ se3.inverse(exact))))
+    assert errors[0] == errors[2] != errors[1]
+    assert max(errors) < 0.004
+
+
 def pyramids(
     images: tuple[Image, Image, np.ndarray], backend: str, max_points: int = 20000
 ) -> tuple:

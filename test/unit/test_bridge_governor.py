@@ -56,20 +56,20 @@ def test_frames_passed_over_are_pressure_even_if_the_others_are_in_time() -> Non
     assert 'passed over' in governor.reason
 
 
-def test_tracking_works_at_the_resolution_that_its_period_allows() -> None:
+def test_tracking_looks_as_closely_as_its_period_allows() -> None:
     governor = Governor()
-    full_s = 0.015  # of a processor per frame; each level less takes a third less
 
-    def play(rate_hz: float, start_s: float) -> int:
+    def play(rate_hz: float, start_s: float) -> float:
         for i in range(round(10 * rate_hz)):
             governor.note_arrival(start_s + i / rate_hz)
-            governor.note_cost(full_s * 0.67**governor.coarser)
-        return governor.coarser
+            governor.note_cost(0.005 + 0.010 * governor.points_share)
+        return governor.points_share
 
-    assert play(30, 0.0) == 0
-    assert play(60, 100.0) == 1
-    assert play(120, 200.0) == 2
-    assert play(30, 300.0) == 0
+    assert play(30, 0.0) == 1
+    assert play(60, 100.0) == 0.5
+    assert play(90, 200.0) == 0.25
+    assert play(300, 300.0) == 1 / 8
+    assert play(30, 400.0) == 1
 
 
 @pytest.mark.parametrize('rate_hz', [5.0, 30.0, 60.0])

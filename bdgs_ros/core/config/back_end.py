@@ -13,7 +13,7 @@ class BundleConfig:
     """Bundle adjustment of keyframes by the corners that they share."""
 
     enabled: bool = param(True, 'join each new keyframe with the window and what shows the same')
-    window: int = param(3, 'newest keyframes that a new one is joined with', low=1, high=100)
+    window: int = param(4, 'newest keyframes that a new one is joined with', low=1, high=100)
     older: int = param(3, 'older keyframes that show the same, joined too', low=0, high=100)
     overlap: float = param(0.4, 'least share of its corners in an older one', low=0.0, high=1.0)
     corners: int = param(150, 'followed from each keyframe', low=20, high=1000)
