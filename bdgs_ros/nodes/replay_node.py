@@ -28,7 +28,7 @@ from bdgs_ros.data.bag_cursor import RawMessage
 from bdgs_ros.data.trajectory_io import write_text_atomically
 
 _POLL_S = 0.05
-_SETTLE_S = 0.3
+_SETTLE_S = 1.0
 """A subscriber that we know of may not know of us yet."""
 _RESEND_S = 5.0
 _QUIET_S = 1.0
