@@ -25,6 +25,7 @@ _AT_EASE, _AT_EASE_S = 1.0, 0.03  # there is room
 _LATE = 2.0  # periods that a frame may wait while newer ones are there
 _COSTS = 12  # frames that tell what one costs
 _FULL, _ROOM = 0.8, 0.35  # of the period: a frame costs too much, or could cost twice as much
+_NEEDED = 2  # processors of the graph at camera rate
 _FEWEST = 1 / 8  # of the points
 
 
@@ -48,6 +49,11 @@ class Shed(IntEnum):
         """For diagnostics."""
         names = [step.name.lower() for step in Shed if Shed.NOTHING < step <= self]
         return ', '.join(names) or 'nothing'
+
+
+def spare_processors(level: Shed, processors: int) -> int:
+    """Return how many processors have nothing to do for the graph; none while it is short."""
+    return max(processors - _NEEDED, 0) if level is Shed.NOTHING else 0
 
 
 class Governor:

@@ -109,6 +109,7 @@ class TrackingNodeConfig(GraphConfig):
         low=0,
         high=90,
     )
+    tracking_cpus: str = param('', "processors that tracking keeps to, such as '3'; empty: any")
     map_file: str = param(
         '', 'where bdgs/save_map writes and bdgs/load_map reads; may change at run time'
     )

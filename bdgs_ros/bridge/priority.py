@@ -10,6 +10,8 @@ import sys
 import threading
 from pathlib import Path
 
+from bdgs_ros.core.errors import ConfigError
+
 _log = logging.getLogger(__name__)
 
 _LONGEST_RUN_US = 1_000_000
@@ -102,6 +104,35 @@ def _schedule(policy: int, priority: int) -> None:
     for task in Path('/proc/self/task').iterdir():
         with contextlib.suppress(ProcessLookupError):  # it has ended
             os.sched_setscheduler(int(task.name), policy, os.sched_param(priority))
+
+
+def keep_to(cpus: str) -> None:
+    """
+    Keep all threads of this process, and those to come, to some processors (Linux).
+
+    Parameters
+    ----------
+    cpus : str
+        Their numbers, such as '2,3'; empty: any.
+
+    Raises
+    ------
+    ConfigError
+        If these are no processors that this process may use.
+
+    """
+    if not cpus or not sys.platform.startswith('linux'):
+        return
+    allowed = os.sched_getaffinity(0)
+    numbers = {int(word) for word in cpus.split(',') if word.strip().isdigit()}
+    if len(numbers) != cpus.count(',') + 1 or not numbers <= allowed:
+        raise ConfigError(
+            f"expected numbers of processors out of {sorted(allowed)}, such as '0,1', "
+            f"received '{cpus}'"
+        )
+    for task in Path('/proc/self/task').iterdir():
+        with contextlib.suppress(ProcessLookupError):  # it has ended
+            os.sched_setaffinity(int(task.name), numbers)
 
 
 def leave_one(threads: int) -> int:

@@ -103,6 +103,7 @@ class Mapper:
         self._photos: list[Photo] = []
         self._ranges: list[RangeImage] = []
         self._count = 0
+        self._polished = 0  # steps since the last keyframe
         self._index_of: dict[int, int] = {}  # of this run's keyframes, by stamp
         self._rng = np.random.default_rng(self._config.seed)
 
@@ -158,6 +159,28 @@ class Mapper:
         if early is not None and self._hurried():
             return None
         return self._answer(current, level.camera)
+
+    def polish(self, most: int) -> bool:
+        """
+        Take one more step of optimisation while there is nothing else to do.
+
+        Parameters
+        ----------
+        most : int
+            Steps after each keyframe.
+
+        Returns
+        -------
+        more : bool
+            Whether there are any left.
+
+        """
+        if not self.grows or not self.keyframes or self._polished >= most:
+            return False
+        among = self.keyframes[-self._config.window :] if self._polished % 2 else self.keyframes
+        self._optimiser.polish(self.map, among[self._rng.integers(len(among))])
+        self._polished += 1
+        return self._polished < most
 
     def _answer(self, current: MapKeyframe, camera: PinholeCamera) -> ModelView:
         """Render what tracking gets."""
@@ -278,6 +301,7 @@ class Mapper:
             self.history.refresh([redundant])
             self.keyframes.remove(redundant)
         self._count += 1
+        self._polished = 0
         return current
 
     def _calibrate(self, current: MapKeyframe, level: Level, static: Rendered) -> None:

@@ -143,6 +143,12 @@ class Optimiser:
             gaussians, keyframe, level_index, visible, penalised, rate_scale, rate_scale**2
         )
 
+    def polish(self, gaussians: GaussianMap, keyframe: MapKeyframe) -> float:
+        """Take one step at the finest level that leaves the keyframe's pose as it was told."""
+        visible = gaussians.visible_mask()
+        penalised = visible & (gaussians.states == State.DYNAMIC)
+        return self._step(gaussians, keyframe, 0, visible, penalised, pose_scale=0.0)
+
     def _plan(self, newest: MapKeyframe, others: Sequence[MapKeyframe]) -> tuple[Plan, Plan]:
         """Return keyframe and pyramid level of each iteration: coarse ones, finest ones."""
         levels = self._levels(len(newest.levels))

@@ -21,13 +21,13 @@ from bdgs_ros.bridge import conversions, parameters, topics
 from bdgs_ros.bridge.adjuster import Adjuster
 from bdgs_ros.bridge.cdr_image import CdrImage, image_from_cdr
 from bdgs_ros.bridge.frames import FrameDecoder, FrameSource, RawFrame
-from bdgs_ros.bridge.governor import Shed
+from bdgs_ros.bridge.governor import Shed, spare_processors
 from bdgs_ros.bridge.health import Health
 from bdgs_ros.bridge.load import hear_load
 from bdgs_ros.bridge.map_output import MapOutput
 from bdgs_ros.bridge.model_view import ModelPublisher
 from bdgs_ros.bridge.node_config import MappingNodeConfig
-from bdgs_ros.bridge.priority import leave_one
+from bdgs_ros.bridge.priority import leave_one, processors
 from bdgs_ros.bridge.runner import GraphNode, run
 from bdgs_ros.bridge.stamped import StampBuffer
 from bdgs_ros.bridge.worker import Worker
@@ -292,9 +292,19 @@ class MappingNode(GraphNode):
             shown = self._shed < Shed.RENDERS or self._mapper.frozen
             more_to_render = shown and self._output.render(self._mapper)
             self._output.publish_map(self._mapper, self._live.version, self._config.belief.margin)
+            more_to_polish = self._polish()
         self._map_services.save_if_due()
-        if more_to_render:
+        if more_to_render or more_to_polish:
             self._worker.wake()
+
+    def _polish(self) -> bool:
+        """Spend a processor that nobody needs on the map; say whether there is more to do."""
+        if self._config.lockstep or self._adjusting.waiting or self._worker.waiting:
+            return False
+        spare = spare_processors(self._shed, processors())
+        more = self._mapper.polish(self._config.mapping.spare * spare)
+        self._live.version += more
+        return more
 
     def _forget(self) -> None:
         self._frames.clear()

@@ -20,6 +20,7 @@ from bdgs_ros.bridge.health import Health
 from bdgs_ros.bridge.load import LoadWatch
 from bdgs_ros.bridge.node_config import TrackingNodeConfig
 from bdgs_ros.bridge.pose_output import PoseOutput
+from bdgs_ros.bridge.priority import keep_to
 from bdgs_ros.bridge.runner import GraphNode, run
 from bdgs_ros.bridge.services import serve_switch, serve_trigger
 from bdgs_ros.bridge.status import FrameState, FrameStatus, status_to_message
@@ -42,6 +43,7 @@ class TrackingNode(GraphNode):
         super().__init__('tracking_node', **options)
         config = parameters.declare(self, TrackingNodeConfig(), runtime=_AT_RUN_TIME)
         cv2.setNumThreads(1)
+        keep_to(config.tracking_cpus)
         self._config = config
         self._paused = False
         self._has_begun = False

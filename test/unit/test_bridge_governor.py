@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from bdgs_ros.bridge.governor import Governor, Shed
+from bdgs_ros.bridge.governor import Governor, Shed, spare_processors
 from bdgs_ros.bridge.worker import Worker
 
 PERIOD_S = 1 / 30
@@ -70,6 +70,11 @@ def test_tracking_looks_as_closely_as_its_period_allows() -> None:
     assert play(90, 200.0) == 0.25
     assert play(300, 300.0) == 1 / 8
     assert play(30, 400.0) == 1
+
+
+def test_the_map_gets_the_processors_that_nobody_needs() -> None:
+    assert [spare_processors(Shed.NOTHING, count) for count in (1, 2, 4, 8)] == [0, 0, 2, 6]
+    assert spare_processors(Shed.RENDERS, 8) == 0
 
 
 @pytest.mark.parametrize('rate_hz', [5.0, 30.0, 60.0])

@@ -79,3 +79,28 @@ print(note, warned, os.sched_getscheduler(0) == os.SCHED_OTHER)
 
 def test_priority_zero_asks_for_nothing() -> None:
     assert run('print(repr(go_first(0)))') == "''"
+
+
+@pytest.mark.skipif(not hasattr(os, 'sched_setaffinity'), reason='Linux has it')
+def test_a_process_keeps_to_the_processors_it_is_told() -> None:
+    cpu = min(os.sched_getaffinity(0))
+    script = f"""
+import os, threading, time
+from bdgs_ros.bridge.priority import keep_to
+from bdgs_ros.core.errors import ConfigError
+keep_to('')
+found = []
+early = threading.Thread(target=lambda: (time.sleep(0.3), found.append(os.sched_getaffinity(0))))
+early.start()
+keep_to('{cpu}')
+early.join()
+assert found == [os.sched_getaffinity(0)] == [{{{cpu}}}], found
+for wrong in ('x', '1-2', '99999', '{cpu},'):
+    try:
+        keep_to(wrong)
+    except ConfigError as error:
+        assert wrong in str(error)
+    else:
+        raise AssertionError(wrong)
+"""
+    subprocess.run([sys.executable, '-c', script], check=True)

@@ -94,6 +94,30 @@ def test_an_early_view_has_to_do_where_the_next_keyframe_waits() -> None:
     assert len(mapper.map)
 
 
+def test_spare_time_makes_the_map_better_and_moves_no_keyframe() -> None:
+    config = replace(CONFIG.mapping, iterations=4)
+    mapper = Mapper(config, CONFIG.belief)
+    T = poses(1)[0]
+    frame = wall(0, T)
+    mapper.process(Keyframe(frame, T, no_prior()))
+    assert not mapper.polish(0)
+
+    def error() -> float:
+        view = mapper.view(0, T, CAMERA)
+        return float(np.abs(view.color.astype(float) - frame.color).mean())
+
+    before, steps = error(), 1
+    while mapper.polish(30):
+        steps += 1
+    assert steps == 30
+    assert error() < 0.9 * before
+    np.testing.assert_array_equal(mapper.keyframes[0].T_world_camera, T)
+    mapper.process(Keyframe(wall(SECOND, T), T, no_prior()))
+    assert mapper.polish(30)
+    mapper.frozen = True
+    assert not mapper.polish(30)
+
+
 def test_labelled_people_leave_no_gaussians() -> None:
     mapper = Mapper(CONFIG.mapping, CONFIG.belief)
     frame, where = box_in_front(wall(0, np.eye(4)))

@@ -171,6 +171,12 @@ class MappingConfig:
     hurried: int = param(
         4, 'iterations while the next keyframe waits (realtime)', low=0, high=1000
     )
+    spare: int = param(
+        20,
+        'more iterations per keyframe for each processor beyond two, while none waits (realtime)',
+        low=0,
+        high=10000,
+    )
     window: int = param(8, 'newest keyframes in every optimisation', low=1, high=64)
     keyframes: int = param(
         64, 'keyframes whose images are kept; of others only the Gaussians', low=2, high=100000
