@@ -21,6 +21,20 @@ _SYNTH = 'synth_'
 
 
 @dataclass(frozen=True)
+class SynthCamera:
+    """Size and rate of a synthetic recording."""
+
+    width: int = 640
+    height: int = 480
+    rate_hz: int = 30
+
+    @property
+    def suffix(self) -> str:
+        """What names say of it: nothing where it is the usual one."""
+        return '' if self == SynthCamera() else f'_{self.width}x{self.height}_{self.rate_hz}hz'
+
+
+@dataclass(frozen=True)
 class RealSequence:
     """A recording under `data/` of the data folder."""
 
@@ -59,22 +73,31 @@ def real_path(name: str, data: Path) -> Path:
     return path
 
 
-def synth_path(scenario: str, seed: int, frames: int, work: Path) -> Path:
+def synth_path(
+    scenario: str, seed: int, frames: int, work: Path, camera: SynthCamera | None = None
+) -> Path:
     """Return the folder of a synthetic recording, made now if it is not there yet."""
-    path = work / 'synth' / f'{scenario}_{seed}_{frames}'
+    camera = camera or SynthCamera()
+    path = work / 'synth' / f'{scenario}_{seed}_{frames}{camera.suffix}'
     if not path.is_dir():
-        _record(path, scenario, seed, frames)
+        _record(path, scenario, seed, frames, camera)
     return path
 
 
-def _record(path: Path, scenario: str, seed: int, frames: int) -> None:
+def _record(path: Path, scenario: str, seed: int, frames: int, camera: SynthCamera) -> None:
     from tqdm import tqdm
 
     from bdgs_ros.data.synth import write_recording
 
     with tqdm(total=frames, desc=path.name, unit='frame', file=sys.stderr, leave=False) as bar:
         write_recording(
-            path, scenario, seed, frames, progress=lambda done, total: bar.update(done - bar.n)
+            path,
+            scenario,
+            seed,
+            frames,
+            size=(camera.width, camera.height),
+            rate_hz=camera.rate_hz,
+            progress=lambda done, total: bar.update(done - bar.n),
         )
 
 
@@ -93,8 +116,9 @@ def cell_recording(cell: Cell, options: Options) -> Path:
     """Return the recording of a cell; its sequence is `synth_SCENARIO` or a real one's name."""
     if cell.settings['kind'] == 'real':
         return real_path(cell.sequence, options.data)
-    scenario = cell.sequence.removeprefix(_SYNTH)
-    return synth_path(scenario, cell.seed, cell.settings['frames'], options.work.parent)
+    camera = SynthCamera(*cell.settings.get('camera', ()))
+    scenario = cell.sequence.removeprefix(_SYNTH).removesuffix(camera.suffix)
+    return synth_path(scenario, cell.seed, cell.settings['frames'], options.work.parent, camera)
 
 
 def prepare(cell: Cell, options: Options) -> None:

@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import astuple
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,8 @@ images to the pose; labels_age: how much older the labels are that a frame is tr
 keyframes_mapped: of the keyframes found; end_ms: from the last frame until everything is written.
 ATE over the frames with a pose, online and final, as in bench slam. live_beside1: beside one
 process, in a session of its own, that uses one processor; _rate2: replayed twice as fast; _no_rr:
-with ordinary priorities. CPU: processor seconds per second of replay.
+with ordinary priorities; 848x480_60hz: a camera of that size and rate. CPU: processor seconds per
+second of replay.
 """
 _NODES = ('tracking', 'detection', 'mapping', 'replay')
 TABLES = {
@@ -55,6 +57,7 @@ TABLES = {
 }
 
 _SYNTH = ('walking_xyz', 'loop_room')
+_OTHER_CAMERAS = (sequences.SynthCamera(848, 480, 60), sequences.SynthCamera(1280, 720, 30))
 _LIVE_TIMEOUT_S = 300.0
 _BUSY = f"""
 import time
@@ -97,12 +100,22 @@ def cells(options: Options) -> list[Cell]:
     for scenario in _SYNTH:
         synth = {**sequences.synth_settings(scenario, options), **common}
         chosen.append((sequences.synth_name(scenario), synth))
+    chosen += [_other_camera(camera, common, options) for camera in _OTHER_CAMERAS]
     found = []
     for name, settings in chosen:
         found.append(Cell(name, 'alone', 0, settings))
         for how in _live_configurations(options):
             found += [Cell(name, how, seed, settings) for seed in options.seeds]
     return found
+
+
+def _other_camera(
+    camera: sequences.SynthCamera, common: Mapping[str, Any], options: Options
+) -> tuple[str, dict[str, Any]]:
+    """Return name and settings of the first scenario as another camera sees it."""
+    settings = {**sequences.synth_settings(_SYNTH[0], options), **common}
+    settings['camera'] = astuple(camera)
+    return f'{sequences.synth_name(_SYNTH[0])}{camera.suffix}', settings
 
 
 def _live_configurations(options: Options) -> list[str]:
