@@ -122,7 +122,7 @@ def _keep_memory() -> None:
     Have freed memory kept for the next image, where the C library is glibc.
 
     By default every image that is freed goes back to the system, and every new one comes page by
-    page: a fifth of a second in every second for a node that only passes images on.
+    page: a tenth of a processor for a node that only passes images on.
     """
     if hasattr(libc := ctypes.CDLL(None), 'mallopt'):
         libc.mallopt(_M_MMAP_THRESHOLD, _LARGEST_FROM_HEAP_BYTES)
@@ -133,7 +133,7 @@ def _settle_garbage() -> None:
     """
     Take what was imported out of the garbage collector's rounds.
 
-    A full round over it held a frame up by 36 ms, every few seconds.
+    A full round over it takes 36 ms, in which no frame is tracked.
     """
     gc.collect()
     gc.freeze()

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -51,6 +52,7 @@ from bdgs_ros.mapping.vignette import Photo, Vignette
 
 Mask = NDArray[np.bool_]
 Answer = Callable[[ModelView], None]
+Seen = TypeVar('Seen')
 
 _log = logging.getLogger(__name__)
 
@@ -189,10 +191,14 @@ class Mapper:
     def _straighten(self, fine: Keyframe, small: Keyframe) -> tuple[Keyframe, Keyframe]:
         """Learn the bend of the depth sensor, and take out of the depth what is known of it."""
         measured = RangeImage.of(small)
-        for earlier in self._ranges:
+        for earlier in self._compared(self._ranges):
             self.depth_bend.learn(measured, earlier)
         self._ranges = [*self._ranges, measured][-_PHOTOS:]
         return self._unbent(fine), self._unbent(small)
+
+    def _compared(self, earlier: list[Seen]) -> list[Seen]:
+        """Return which earlier images a new one is compared with: in a hurry, the oldest alone."""
+        return earlier[:1] if self._hurried() else earlier
 
     def _unbent(self, keyframe: Keyframe) -> Keyframe:
         frame = keyframe.frame
@@ -307,7 +313,7 @@ class Mapper:
     def _calibrate(self, current: MapKeyframe, level: Level, static: Rendered) -> None:
         """Learn the lens's falloff from earlier keyframes, and the exposure from the map."""
         photo = Photo.of(level, current.T_world_camera)
-        for earlier in self._photos:
+        for earlier in self._compared(self._photos):
             self.vignette.learn(photo, earlier)
         self._photos = [*self._photos, photo][-_PHOTOS:]
         exposure = fit_exposure(static, level)
