@@ -36,7 +36,7 @@ _log = logging.getLogger(__name__)
 _RECENT = 300  # poses of frames: keyframes may come late
 _HURRIED_WINDOW, _HURRIED_OLDER = 2, 1  # that a new one is joined with when the next one waits
 _NEWEST = 8  # keyframes that stay, and are no places to be recognised
-_UNLOOKED = 3  # keyframes whose features are found when there is time; older ones are no places
+_UNLOOKED = 3  # keyframes in a row, in a hurry, whose features wait: places come seldom
 _RENEWED = 12  # pairs condensed again at a keyframe, at most
 _OFF_RAD = 0.002  # how far the images of a pair may be bent otherwise than it was condensed with
 _OVERCONFIDENT = 3.0  # pairs share velocities, so their errors are not independent
@@ -69,7 +69,7 @@ class BackEnd:
         Sizes and noise.
     hurried : callable
         Asked at each keyframe whether the next one waits already; then it is joined with few
-        others. Places that it might show are looked for later.
+        others, and places that it might show are looked for at every third keyframe.
 
     """
 
@@ -149,9 +149,9 @@ class BackEnd:
         self._unlooked.append(keyframe)
         hurried = self._hurried()
         self._join_all(corners, self._partners(corners, hurried))
+        if self._config.loop.enabled and (not hurried or len(self._unlooked) == _UNLOOKED):
+            self._close_loop(corners)
         if not hurried:
-            if self._config.loop.enabled:
-                self._close_loop(corners)
             self._renew()
         transforms = self._solve()
         self._drop_redundant()

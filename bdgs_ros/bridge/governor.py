@@ -40,7 +40,7 @@ class Shed(IntEnum):
     LABELS = 3
     """Half of the detector's images."""
     PAIRS = 4
-    """All but a few pairs of the back end; places are looked for later."""
+    """All but a few pairs of the back end; places are looked for a third as often."""
     KEYFRAMES = 5
     """Every other keyframe."""
 
