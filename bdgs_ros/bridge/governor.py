@@ -24,7 +24,7 @@ _PRESSED, _PRESSED_S = 1.5, 0.04  # periods and s from image to pose, 90th perce
 _AT_EASE, _AT_EASE_S = 1.0, 0.03  # there is room
 _LATE = 2.0  # periods that a frame may wait while newer ones are there
 _COSTS = 12  # frames that tell what one costs
-_FULL, _ROOM = 0.8, 0.35  # of the period: a frame costs too much, or could cost twice as much
+_FULL, _ROOM = 0.9, 0.35  # of the period: a frame costs too much, or could cost twice as much
 _NEEDED = 2  # processors of the graph at camera rate
 _FEWEST = 1 / 8  # of the points
 

@@ -62,7 +62,7 @@ def test_tracking_looks_as_closely_as_its_period_allows() -> None:
     def play(rate_hz: float, start_s: float) -> float:
         for i in range(round(10 * rate_hz)):
             governor.note_arrival(start_s + i / rate_hz)
-            governor.note_cost(0.005 + 0.010 * governor.points_share)
+            governor.note_cost(0.006 + 0.010 * governor.points_share)
         return governor.points_share
 
     assert play(30, 0.0) == 1
