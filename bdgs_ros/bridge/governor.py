@@ -117,9 +117,12 @@ class Governor:
         if min(len(self._costs_s), len(self._arrivals)) < _COSTS:
             return
         share = float(np.median(self._costs_s)) / self.period_s
-        wanted = self.points_share * (0.5 if share > _FULL else 2.0 if share < _ROOM else 1.0)
-        if self.points_share != (wanted := min(max(wanted, _FEWEST), 1.0)):
-            self.points_share = wanted
+        before = self.points_share
+        if share > _FULL:
+            self.points_share = max(before / 2, _FEWEST)
+        elif share < _ROOM:
+            self.points_share = min(before * 2, 1.0)
+        if self.points_share != before:
             self._costs_s.clear()
 
     def _pressure(self) -> str:

@@ -180,7 +180,8 @@ class Mapper:
         if not self.grows or not self.keyframes or self._polished >= most:
             return False
         among = self.keyframes[-self._config.window :] if self._polished % 2 else self.keyframes
-        self._optimiser.polish(self.map, among[self._rng.integers(len(among))])
+        keyframe = among[self._rng.integers(len(among))]
+        self._optimiser.step(self.map, keyframe, 0, move=False)
         self._polished += 1
         return self._polished < most
 

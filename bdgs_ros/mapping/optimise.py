@@ -121,6 +121,8 @@ class Optimiser:
         keyframe: MapKeyframe,
         level_index: int,
         rate_scale: float = 1.0,
+        *,
+        move: bool = True,
     ) -> float:
         """
         Take one step of Eq. 7 on one view and return its loss.
@@ -135,19 +137,16 @@ class Optimiser:
             Of the keyframe's pyramid, 0 is the finest.
         rate_scale : float
             Factor on every learning rate.
+        move : bool
+            Whether the keyframe's pose is adapted; else it stays as it was told.
 
         """
         visible = gaussians.visible_mask()
         penalised = visible & (gaussians.states == State.DYNAMIC)
+        pose_scale = rate_scale**2 if move else 0.0
         return self._step(
-            gaussians, keyframe, level_index, visible, penalised, rate_scale, rate_scale**2
+            gaussians, keyframe, level_index, visible, penalised, rate_scale, pose_scale
         )
-
-    def polish(self, gaussians: GaussianMap, keyframe: MapKeyframe) -> float:
-        """Take one step at the finest level that leaves the keyframe's pose as it was told."""
-        visible = gaussians.visible_mask()
-        penalised = visible & (gaussians.states == State.DYNAMIC)
-        return self._step(gaussians, keyframe, 0, visible, penalised, pose_scale=0.0)
 
     def _plan(self, newest: MapKeyframe, others: Sequence[MapKeyframe]) -> tuple[Plan, Plan]:
         """Return keyframe and pyramid level of each iteration: coarse ones, finest ones."""
