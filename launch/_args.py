@@ -2,12 +2,17 @@
 
 from launch.actions import DeclareLaunchArgument
 from launch.conditions import IfCondition
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch.substitutions import (
+    EnvironmentVariable,
+    LaunchConfiguration,
+    PathJoinSubstitution,
+)
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 PACKAGE = 'bdgs_ros'
+MEMORY = 'glibc.malloc.hugetlb=1'  # as in bdgs_ros.nodes, which slam_node reads
 NODES = ('detection_node', 'tracking_node', 'mapping_node')
 # (name, default, description); a default of None is filled in below
 GRAPH_ARGUMENTS = (
@@ -99,6 +104,9 @@ def _node(executable, parameters, **options):
         parameters=parameters,
         remappings=_remappings(),
         output='screen',
+        additional_env={
+            'GLIBC_TUNABLES': EnvironmentVariable('GLIBC_TUNABLES', default_value=MEMORY)
+        },
         **options,
     )
 

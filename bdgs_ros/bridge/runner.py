@@ -21,7 +21,7 @@ from bdgs_ros.core.errors import BdgsError
 
 PARENT_VARIABLE = 'BDGS_PARENT_PID'
 _PR_SET_PDEATHSIG = 1
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of mallopt(3)
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # of mallopt(3)
 _KEPT_BYTES = 1 << 28
 _LARGEST_FROM_HEAP_BYTES = 1 << 25  # glibc takes no more
 _SPIN_S = 0.1
@@ -127,6 +127,7 @@ def _keep_memory() -> None:
     if hasattr(libc := ctypes.CDLL(None), 'mallopt'):
         libc.mallopt(_M_MMAP_THRESHOLD, _LARGEST_FROM_HEAP_BYTES)
         libc.mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
+        libc.mallopt(_M_ARENA_MAX, 1)
 
 
 def _settle_garbage() -> None:

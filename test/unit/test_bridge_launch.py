@@ -61,6 +61,11 @@ def test_launch_files(described: Any, file: str, executables: set[str]) -> None:
     assert all(a.kwargs['description'] for a in arguments)
     assert {n.kwargs['executable'] for n in nodes} == executables
     known = {*known_names(), 'use_sim_time'}
+    ours = [n for n in nodes if n.kwargs['package'] == 'bdgs_ros']
+    tunables = [n.kwargs['additional_env']['GLIBC_TUNABLES'].kwargs for n in ours]
+    import bdgs_ros.nodes
+
+    assert tunables == [{'default_value': bdgs_ros.nodes.MEMORY}] * len(ours)
     for node in nodes:
         for parameters in node.kwargs.get('parameters', []):
             if isinstance(parameters, dict):
