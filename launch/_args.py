@@ -12,7 +12,11 @@ from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 PACKAGE = 'bdgs_ros'
-MEMORY = 'glibc.malloc.hugetlb=1'  # as in bdgs_ros.nodes, which slam_node reads
+# As in bdgs_ros.nodes, which slam_node reads: how a process takes memory.
+MEMORY = (
+    'glibc.malloc.arena_max=1:glibc.malloc.mmap_threshold=33554432'
+    ':glibc.malloc.trim_threshold=268435456:glibc.malloc.hugetlb=1'
+)
 NODES = ('detection_node', 'tracking_node', 'mapping_node')
 # (name, default, description); a default of None is filled in below
 GRAPH_ARGUMENTS = (

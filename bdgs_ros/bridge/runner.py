@@ -21,9 +21,6 @@ from bdgs_ros.core.errors import BdgsError
 
 PARENT_VARIABLE = 'BDGS_PARENT_PID'
 _PR_SET_PDEATHSIG = 1
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # of mallopt(3)
-_KEPT_BYTES = 1 << 28
-_LARGEST_FROM_HEAP_BYTES = 1 << 25  # glibc takes no more
 _SPIN_S = 0.1
 REFUSED = 2
 """Exit status when parameters or inputs were refused."""
@@ -73,7 +70,6 @@ def run(
 
     """
     follow_parent()
-    _keep_memory()
     stop = _catch_signals()
     transport.configure()
     rclpy.init(
@@ -115,19 +111,6 @@ def make_executor() -> Executor:
     except ImportError:
         return SingleThreadedExecutor()
     return EventsExecutor()
-
-
-def _keep_memory() -> None:
-    """
-    Have freed memory kept for the next image, where the C library is glibc.
-
-    By default every image that is freed goes back to the system, and every new one comes page by
-    page: a tenth of a processor for a node that only passes images on.
-    """
-    if hasattr(libc := ctypes.CDLL(None), 'mallopt'):
-        libc.mallopt(_M_MMAP_THRESHOLD, _LARGEST_FROM_HEAP_BYTES)
-        libc.mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
-        libc.mallopt(_M_ARENA_MAX, 1)
 
 
 def _settle_garbage() -> None:
