@@ -64,7 +64,7 @@ def native_extensions():
             language='c++',
             optional=True,
         )
-        for name in ('aligner', 'harmonics', 'two_views')
+        for name in ('aligner', 'harmonics', 'surface', 'two_views')
     ]
     return [m for m in modules if os.path.exists(m.sources[0])]
 

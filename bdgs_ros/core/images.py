@@ -17,9 +17,9 @@ _SAME_SURFACE = 0.03  # of the depth
 
 def without_specks(mask: Mask, share: float) -> Mask:
     """Drop connected components smaller than `share` of the image, mask of shape (H, W)."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
-    if count < 2:
+    if np.count_nonzero(mask) < share * mask.size:
         return np.zeros_like(mask)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
     large = stats[:, cv2.CC_STAT_AREA] >= share * mask.size
     large[0] = False
     return np.asarray(large[labels])

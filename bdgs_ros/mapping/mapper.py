@@ -29,7 +29,7 @@ from bdgs_ros.core.types import (
 from bdgs_ros.mapping import growth, prune
 from bdgs_ros.mapping.depth_bend import DepthBend, RangeImage
 from bdgs_ros.mapping.exposure import fit_exposure
-from bdgs_ros.mapping.gaussians import GaussianMap
+from bdgs_ros.mapping.gaussians import GaussianMap, NewGaussians
 from bdgs_ros.mapping.history import History
 from bdgs_ros.mapping.inference import Inference
 from bdgs_ros.mapping.keyframe_store import KeyframeSet
@@ -263,7 +263,8 @@ class Mapper:
         resolved = prune.resolved_by(self.map, se3.inverse(T), camera)
         config = self._config.prune
         prune.note_contribution(self.map, agree, static.max_weight, resolved, config)
-        self.map.keep(~(gone | prune.redundant(self.map, config)))
+        useful = prune.worth_keeping(self.map, config) & ~prune.redundant(self.map, config)
+        self.map.keep(useful & ~gone)
         return static
 
     def _in_map_colors(self, frame: RgbdFrame) -> NDArray[np.float32]:
@@ -330,29 +331,39 @@ class Mapper:
         config = self._config.insert
         usable = growth.usable_depth(level.depth_m, config)
         sigma = self._sigma(level.depth_m)
-        surface = fit_surface(level.depth_m, usable, level.camera, config.normal_px, sigma)
-
-        def grow(pixels: Mask, belief: float) -> None:
-            if not pixels.any():
-                return
-            new = lift(current, level, surface, pixels, belief, config)
-            self.map.append(new, config.opacity, current.index)
-            rows = np.arange(len(self.map) - len(new.means), len(self.map))
-            self.inference.ask_memory(self.map, rows, current.index)
-
         everything = self.render_everything(current.T_world_camera, level.camera)
         unknown = ~growth.explained(level.depth_m, everything, sigma, config.depth_sigma)
-        empty = growth.empty_pixels(static, config) & unknown
         still = growth.far_from_movers(level.static, config)
-        grow(usable & still & empty, self._belief.initial)
+        empty = usable & still & growth.empty_pixels(static, config) & unknown
         # What stands in front of the map and no detector names may be new furniture: it enters
         # hidden by Eq. 11, and the filter decides whether it stays.
-        new = without_specks(unnamed & unknown, _MIN_BLOB_SHARE)
-        grow(usable & new, self._belief.initial_in_front)
+        new = usable & without_specks(unnamed & unknown, _MIN_BLOB_SHARE)
+        surface = fit_surface(
+            level.depth_m, usable, empty | new, level.camera, config.normal_px, sigma
+        )
+        for pixels, belief in (
+            (empty, self._belief.initial),
+            (new, self._belief.initial_in_front),
+        ):
+            if pixels.any():
+                added = lift(current, level, surface, pixels, belief, config)
+                self._grow(added, current.index)
+
+    def _grow(self, new: NewGaussians, index: int) -> None:
+        """Add Gaussians, and ask what earlier keyframes saw where they are."""
+        self.map.append(new, self._config.insert.opacity, index)
+        rows = np.arange(len(self.map) - len(new.means), len(self.map))
+        self.inference.ask_memory(self.map, rows, index)
 
     def _thin(self) -> None:
-        """Take out what is of no use; over the budget, merge neighbours, then drop the least."""
+        """
+        Take out what is of no use; over the budget, merge neighbours, then drop the least.
+
+        In a hurry, what is of no use can wait for the next keyframe.
+        """
         budget = self._config.prune.max_gaussians
+        if self._hurried() and len(self.map) <= budget:
+            return
         self.map.keep(prune.worth_keeping(self.map, self._config.prune))
         if len(self.map) > budget:
             config = self._config.merge

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
+from types import ModuleType
 
 import cv2
 import numpy as np
@@ -12,7 +14,14 @@ from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.types import DepthImage
 
 Array = NDArray[np.float32]
+Double = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+
+_kernels: ModuleType | None
+try:
+    _kernels = import_module('bdgs_ros._surface')
+except ImportError:
+    _kernels = None
 
 _MIN_SHARE = 0.4  # of a window's pixels that must have a depth
 
@@ -26,18 +35,19 @@ class Surface:
     inverse_depth: Array
     """[H, W] of the plane at the pixel where one fits, else as measured; 1/m, 0 = unknown"""
     flat: Mask
-    """[H, W] whether a plane fits"""
+    """[H, W] whether a plane fits, and was asked for"""
 
 
 def fit_surface(
     depth_m: DepthImage,
     usable: Mask,
+    wanted: Mask,
     camera: PinholeCamera,
     largest: int,
     tolerance: Array,
 ) -> Surface:
     """
-    Fit a plane around every pixel, in the largest window in which one fits.
+    Fit a plane around every wanted pixel, in the largest window in which one fits.
 
     A plane n.X = d has inverse depth 1/z = (n.r) / d at the ray r = (x, y, 1), which is affine
     in (x, y): an ordinary least-squares problem whose sums are box filters.
@@ -48,6 +58,8 @@ def fit_surface(
         Metres; 0 = unknown.
     usable : ndarray of bool, shape (H, W)
         Which pixels take part: not those on edges.
+    wanted : ndarray of bool, shape (H, W)
+        Which pixels planes are asked for.
     camera : PinholeCamera
         Of `depth_m`.
     largest : int
@@ -58,51 +70,72 @@ def fit_surface(
     """
     usable = usable & (depth_m > 0)
     measured = np.where(usable, 1 / np.maximum(depth_m, 1e-3), 0).astype(np.float32)
-    normal = [np.zeros(depth_m.shape, np.float32) for _ in range(3)]
+    limit = np.asarray(tolerance * measured**2, np.float32)  # d(1/z) = dz / z^2
+    radii = sorted({max(1, largest >> i) for i in range(3)}, reverse=True)
+    fit = _fit_slowly if _kernels is None else _fit_natively
+    return fit(measured, wanted, camera, radii, limit)
+
+
+def _fit_natively(
+    measured: Array, wanted: Mask, camera: PinholeCamera, radii: list[int], limit: Array
+) -> Surface:
+    assert _kernels is not None
+    found = Surface(
+        np.zeros((*measured.shape, 3), np.float32), measured.copy(), np.zeros(measured.shape, bool)
+    )
+    _kernels.fit_planes(
+        *(measured, camera.rays(), limit, wanted, camera.fx, radii),
+        *(found.normals, found.inverse_depth, found.flat),
+    )
+    return found
+
+
+def _fit_slowly(
+    measured: Array, wanted: Mask, camera: PinholeCamera, radii: list[int], limit: Array
+) -> Surface:
+    usable = measured > 0
+    normals = np.zeros((*measured.shape, 3))
     inverse_depth = measured.copy()
-    flat = np.zeros(depth_m.shape, bool)
-    limit = tolerance * measured**2  # d(1/z) = dz / z^2
-    for radius in sorted({max(1, largest >> i) for i in range(3)}, reverse=True):
+    flat = np.zeros(measured.shape, bool)
+    for radius in radii:
         plane, at_pixel, rms, share = _fit_window(measured, usable, camera, radius)
-        fits = usable & ~flat & (share >= _MIN_SHARE) & (rms < limit)
+        fits = wanted & usable & ~flat & (share >= _MIN_SHARE) & (rms < limit)
         fits &= np.abs(at_pixel - measured) < 2 * limit
-        for axis, coefficient in zip(normal, plane, strict=True):
-            np.negative(coefficient, out=axis, where=fits)
-        np.copyto(inverse_depth, at_pixel, where=fits)
+        normals[fits] = -np.stack(plane, axis=2)[fits]
+        inverse_depth[fits] = at_pixel[fits]
         flat |= fits
-    x, y, z = normal
-    once = np.reciprocal(np.maximum(np.sqrt(x * x + y * y + z * z), np.float32(1e-12)))
-    return Surface(cv2.merge([x * once, y * once, z * once]), inverse_depth, flat)
+    length = np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-12)
+    return Surface((normals / length).astype(np.float32), inverse_depth, flat)
 
 
 def _fit_window(
     inverse_depth: Array, usable: Mask, camera: PinholeCamera, radius: int
-) -> tuple[tuple[Array, Array, Array], Array, Array, Array]:
+) -> tuple[tuple[Double, Double, Double], Double, Double, Double]:
     """
     Fit 1/z = p.(x, y, 1) around every pixel.
 
     Returns, each of shape (H, W): the three of p; 1/z of the plane at the pixel; the root mean
     square residual in 1/m; the share of the window that took part.
     """
-    x, y = (np.asarray(plane, np.float32) for plane in cv2.split(camera.rays())[:2])
-    w, q = usable.astype(np.float32), inverse_depth
+    x, y = cv2.split(camera.rays().astype(np.float64))[:2]
+    w, q = usable.astype(np.float64), inverse_depth.astype(np.float64)
     wx, wy, wq = w * x, w * y, w * q
     terms = (w, wx, wy, wq, wx * x, wx * y, wy * y, wq * x, wq * y, wq * q)
     size = (2 * radius + 1, 2 * radius + 1)
-    sums = [
-        np.asarray(cv2.boxFilter(a, -1, size, borderType=cv2.BORDER_CONSTANT), np.float32)
+    sums: list[Double] = [
+        np.asarray(cv2.boxFilter(a, -1, size, borderType=cv2.BORDER_CONSTANT), np.float64)
         for a in terms
     ]
     share = sums[0]
-    once = np.reciprocal(np.maximum(share, np.float32(1e-6)))
+    once = np.reciprocal(np.maximum(share, 1e-6))
     mx, my, mq, mxx, mxy, myy, mqx, mqy, mqq = (a * once for a in sums[1:])
     sxx, sxy, syy = mxx - mx * mx, mxy - mx * my, myy - my * my
     sqx, sqy, sqq = mqx - mq * mx, mqy - mq * my, mqq - mq * mq
     # A full window has this variance along each axis; far less means one direction is unseen.
     spread = radius * (radius + 1) / (3 * camera.fx**2)
-    once = np.reciprocal(np.maximum(sxx * syy - sxy * sxy, np.float32((0.05 * spread) ** 2)))
+    once = np.reciprocal(np.maximum(sxx * syy - sxy * sxy, (0.05 * spread) ** 2))
     a = (syy * sqx - sxy * sqy) * once
     b = (sxx * sqy - sxy * sqx) * once
     c = mq - a * mx - b * my
-    residual = np.sqrt(np.maximum(sqq - a * sqx - b * sqy, 0))
+    residual = np.sqrt(np.maximum(sqq - a * sqx - b * sqy, 0.0), dtype=np.float64)
     return (a, b, c), a * x + b * y + c, residual, share

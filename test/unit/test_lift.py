@@ -24,7 +24,7 @@ def seen(depth: np.ndarray, T: np.ndarray) -> tuple[MapKeyframe, Surface]:
     levels = build_levels(color, depth.astype(np.float32), moving, CAMERA, 1)
     keyframe = MapKeyframe(0, 0, T, np.zeros(CAMERA.shape, np.uint8), levels)
     tolerance = np.full(CAMERA.shape, 0.01, np.float32)
-    surface = fit_surface(levels[0].depth_m, depth > 0, CAMERA, 4, tolerance)
+    surface = fit_surface(levels[0].depth_m, depth > 0, depth > 0, CAMERA, 4, tolerance)
     return keyframe, surface
 
 

@@ -1,8 +1,10 @@
 """Planes are found where there are planes, and only there."""
 
 import numpy as np
+import pytest
 
 from bdgs_ros.core.camera import PinholeCamera
+from bdgs_ros.mapping import surface as surface_module
 from bdgs_ros.mapping.surface import fit_surface
 
 CAMERA = PinholeCamera(64, 48, 60.0, 60.0, 31.5, 23.5)
@@ -14,7 +16,9 @@ def plane_depth(normal: np.ndarray, distance: float) -> np.ndarray:
 
 
 def fit(depth: np.ndarray, tolerance: float = 0.01):  # type: ignore[no-untyped-def]
-    return fit_surface(depth, depth > 0, CAMERA, 4, np.full(depth.shape, tolerance, np.float32))
+    wanted = np.ones(depth.shape, bool)
+    limits = np.full(depth.shape, tolerance, np.float32)
+    return fit_surface(depth, depth > 0, wanted, CAMERA, 4, limits)
 
 
 def test_the_normal_of_a_slanted_plane_is_found_up_to_the_border() -> None:
@@ -54,3 +58,23 @@ def test_nothing_is_said_where_nothing_was_measured() -> None:
     assert not surface.flat.any()
     assert not surface.normals.any()
     assert (surface.inverse_depth > 0).sum() == 1
+
+
+def test_the_kernel_agrees_with_its_slow_twin(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip('bdgs_ros._surface')
+    rng = np.random.default_rng(3)
+    depth = plane_depth(np.array([0.5, -0.3, -0.8]), 2.0)
+    depth[:, 40:] = 1.2
+    depth += rng.normal(0, 0.004, depth.shape).astype(np.float32) * (rng.random(depth.shape) < 0.5)
+    depth[rng.random(depth.shape) < 0.2] = 0
+    usable = (depth > 0) & (rng.random(depth.shape) < 0.9)
+    wanted = rng.random(depth.shape) < 0.5
+    tolerance = np.full(depth.shape, 0.003, np.float32)
+    fast = fit_surface(depth, usable, wanted, CAMERA, 4, tolerance)
+    monkeypatch.setattr(surface_module, '_kernels', None)
+    slow = fit_surface(depth, usable, wanted, CAMERA, 4, tolerance)
+    np.testing.assert_array_equal(fast.flat, slow.flat)
+    assert not fast.flat[~wanted].any()
+    assert 0.2 < fast.flat[wanted].mean() < 0.9
+    np.testing.assert_allclose(fast.normals, slow.normals, atol=1e-6)
+    np.testing.assert_allclose(fast.inverse_depth, slow.inverse_depth, rtol=1e-6)
