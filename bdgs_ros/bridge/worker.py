@@ -78,6 +78,11 @@ class Worker(Generic[Item]):
         """How many items wait."""
         return len(self._items)
 
+    @property
+    def unfinished(self) -> int:
+        """How many items wait or are being handled."""
+        return len(self._items) + self._busy
+
     def put(self, item: Item) -> None:
         """Append an item; never waits."""
         with self._changed:

@@ -246,8 +246,8 @@ class MappingNode(GraphNode):
     def _is_hurried(self) -> bool:
         if self._config.lockstep:
             return False
-        waiting = self._adjusting.waiting + self._worker.waiting
-        return waiting > 0 or self._shed >= Shed.ITERATIONS
+        next_ = self._adjusting.unfinished + self._worker.waiting
+        return next_ > 0 or self._shed >= Shed.ITERATIONS
 
     def _wait_frame(self, stamp_ns: int) -> RawFrame | None:
         timeout_s = self._config.lockstep_timeout_s if self._config.lockstep else _FRAME_WAIT_S

@@ -152,12 +152,14 @@ def test_what_waits_is_counted() -> None:
     gate = threading.Event()
     worker: Worker[int] = Worker(lambda _: gate.wait(2.0), lambda error: None, capacity=None)
     worker.put(0)
-    while not worker._busy:
+    while worker.waiting:
         time.sleep(0.001)
-    assert worker.waiting == 0
+    assert worker.unfinished == 1
     worker.put(1)
-    assert worker.waiting == 1
+    assert (worker.waiting, worker.unfinished) == (1, 2)
     gate.set()
+    assert worker.wait_idle(2.0)
+    assert worker.unfinished == 0
     worker.stop()
 
 
