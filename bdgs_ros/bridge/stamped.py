@@ -39,11 +39,25 @@ class StampBuffer(Generic[Item]):
         with self._changed:
             return self._items.get(stamp_ns)
 
-    def wait(self, stamp_ns: int, timeout_s: float) -> Item | None:
-        """Return the item of exactly this stamp; None when it has not come in time."""
+    def wait(self, stamp_ns: int, timeout_s: float, *, in_order: bool = False) -> Item | None:
+        """
+        Return the item of exactly this stamp; None when it has not come in time.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            Of the item.
+        timeout_s : float
+            How long to wait.
+        in_order : bool
+            Items come by their stamps: once a later one is there, this one was lost on the way.
+
+        """
         deadline = time.monotonic() + timeout_s
         with self._changed:
             while stamp_ns not in self._items:
+                if in_order and any(stamp > stamp_ns for stamp in self._items):
+                    return None
                 left = deadline - time.monotonic()
                 if left <= 0:
                     return None

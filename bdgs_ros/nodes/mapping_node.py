@@ -66,7 +66,7 @@ class MappingNode(GraphNode):
         super().__init__('mapping_node', **options)
         config = parameters.declare(self, MappingNodeConfig(), runtime=AT_RUN_TIME)
         cv2.setNumThreads(1)
-        self.nice = config.mapping_nice
+        self.nice = config.back_end_nice  # which waits for the images of its keyframes
         self._config = config
         self._health = Health(self, 'mapping')
         self._mapper = Mapper(_mapping_config(config), config.belief, self._is_hurried)
@@ -250,8 +250,10 @@ class MappingNode(GraphNode):
         return next_ > 0 or self._shed >= Shed.ITERATIONS
 
     def _wait_frame(self, stamp_ns: int) -> RawFrame | None:
-        timeout_s = self._config.lockstep_timeout_s if self._config.lockstep else _FRAME_WAIT_S
-        return self._frames.wait(stamp_ns, timeout_s)
+        """Wait for images; in real time some are lost on the way, and the next keyframe waits."""
+        if self._config.lockstep:
+            return self._frames.wait(stamp_ns, self._config.lockstep_timeout_s)
+        return self._frames.wait(stamp_ns, _FRAME_WAIT_S, in_order=True)
 
     def _assemble(self, message: PoseStamped, raw: RawFrame | None) -> Keyframe | None:
         if raw is None:

@@ -95,6 +95,16 @@ def test_stamp_buffer_waits_across_threads() -> None:
     assert buffer.wait(8, 0.01) is None
 
 
+def test_what_was_lost_on_the_way_is_not_waited_for() -> None:
+    buffer: StampBuffer[str] = StampBuffer(4)
+    buffer.put(1, 'one')
+    threading.Timer(0.05, buffer.put, (3, 'three')).start()
+    start = time.monotonic()
+    assert buffer.wait(2, 5.0, in_order=True) is None
+    assert 0.04 < time.monotonic() - start < 2.0
+    assert buffer.wait(3, 5.0, in_order=True) == 'three'
+
+
 def test_stamp_buffer_finds_the_newest_within_an_age() -> None:
     buffer: StampBuffer[int] = StampBuffer(3)
     for stamp in (10, 20, 30, 40):
