@@ -15,7 +15,7 @@ from typing import Any
 
 import yaml
 
-from bdgs_ros.bridge.runner import PARENT_VARIABLE
+from bdgs_ros.bridge.runner import PARENT_VARIABLE, STACKS_SIGNAL
 
 _GRACE_S = 5.0
 _FORWARDED_WITH_VALUE = ('--log-level', '--log-config-file', '--log-file-name', '--enclave', '-e')
@@ -116,9 +116,17 @@ class Children:
         """Return the names of the children that run."""
         return [child.name for child in self.children.values() if child.process is not None]
 
+    def show_stacks(self) -> None:
+        """Have all children write where their threads are, for whoever reads the log."""
+        for process in self._alive():
+            process.send_signal(STACKS_SIGNAL)
+
+    def _alive(self) -> list[subprocess.Popen[bytes]]:
+        return [c.process for c in self.children.values() if c.process is not None]
+
     def stop(self) -> None:
         """End all children, gently first."""
-        alive = [c.process for c in self.children.values() if c.process is not None]
+        alive = self._alive()
         for process in alive:
             process.send_signal(signal.SIGTERM)
         deadline = time.monotonic() + _GRACE_S

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import faulthandler
 import gc
 import os
 import signal
@@ -20,6 +21,8 @@ from bdgs_ros.bridge.priority import give_way, go_first
 from bdgs_ros.core.errors import BdgsError
 
 PARENT_VARIABLE = 'BDGS_PARENT_PID'
+STACKS_SIGNAL = signal.SIGUSR1
+"""A node that gets it writes to its standard error where all its threads are."""
 _PR_SET_PDEATHSIG = 1
 _SPIN_S = 0.1
 REFUSED = 2
@@ -71,6 +74,7 @@ def run(
     """
     follow_parent()
     stop = _catch_signals()
+    faulthandler.register(STACKS_SIGNAL)
     transport.configure()
     rclpy.init(
         args=args if args is not None else sys.argv,

@@ -157,7 +157,11 @@ class SlamNode(GraphNode):
         future = client.call_async(Trigger.Request())
         future.add_done_callback(lambda _: done.set())
         if not done.wait(_SERVICE_TIMEOUT_S):
-            raise BdgsError(f"'{name}' did not answer within {_SERVICE_TIMEOUT_S:g} s")
+            self._children.show_stacks()
+            raise BdgsError(
+                f"'{name}' did not answer within {_SERVICE_TIMEOUT_S:g} s; the log says where the "
+                'threads of all nodes are: please report it'
+            )
         if not future.result().success:
             raise BdgsError(f"'{name}': {future.result().message}")
 

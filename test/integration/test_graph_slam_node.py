@@ -16,6 +16,7 @@ pytestmark = [pytest.mark.ros, pytest.mark.slow]
 
 from graph_processes import Graph, Running  # noqa: E402
 
+from bdgs_ros.bridge.runner import STACKS_SIGNAL  # noqa: E402
 from bdgs_ros.core.types import Trajectory  # noqa: E402
 from bdgs_ros.data.trajectory_io import read_trajectory  # noqa: E402
 
@@ -106,6 +107,9 @@ def test_children_die_with_their_parent_and_dead_ones_are_started_again(graph: G
     before = children(slam)
     names = [Path(f'/proc/{pid}/cmdline').read_text() for pid in before]
     (mapping,) = (pid for pid, name in zip(before, names, strict=True) if 'mapping_node' in name)
+    os.kill(mapping, STACKS_SIGNAL)
+    slam.wait_for('most recent call first', 10.0)
+    assert os.path.exists(f'/proc/{mapping}')
     os.kill(mapping, signal.SIGKILL)
     slam.wait_for('mapping_node ended with status -9; starting it again', 10.0)
     deadline = time.monotonic() + 30
