@@ -109,7 +109,7 @@ def test_children_die_with_their_parent_and_dead_ones_are_started_again(graph: G
     (mapping,) = (pid for pid, name in zip(before, names, strict=True) if 'mapping_node' in name)
     os.kill(mapping, STACKS_SIGNAL)
     slam.wait_for('most recent call first', 10.0)
-    assert os.path.exists(f'/proc/{mapping}')
+    assert Path(f'/proc/{mapping}').exists()
     os.kill(mapping, signal.SIGKILL)
     slam.wait_for('mapping_node ended with status -9; starting it again', 10.0)
     deadline = time.monotonic() + 30
