@@ -1,7 +1,10 @@
 """Build and install bdgs_ros, with pip alone or with colcon."""
 
 import os
+import shutil
+import subprocess
 import sys
+import sysconfig
 from glob import glob
 
 from setuptools import Extension, find_packages, setup
@@ -66,7 +69,28 @@ def native_extensions():
         )
         for name in ('aligner', 'harmonics', 'surface', 'two_views')
     ]
+    if cuda_architecture() is not None:
+        source = os.path.join(ROOT, 'src', 'cuda', 'rasterizer.cu')
+        headers = sorted(glob(os.path.join(ROOT, 'src', 'cuda', '*.*h*')))
+        modules.append(
+            Extension(
+                f'{NAME}._rasterizer_cuda', [source], include_dirs=include, depends=headers,
+                language='c++', optional=True,
+            )
+        )  # fmt: skip
     return [m for m in modules if os.path.exists(m.sources[0])]
+
+
+def cuda_architecture():
+    """
+    Return what nvcc compiles for, or None where there is no nvcc or nothing to compile for.
+
+    That is the card of this machine, or BDGS_CUDA_ARCH (sm_90, all-major) for another's.
+    """
+    if shutil.which('nvcc') is None:
+        return None
+    present = os.path.exists('/proc/driver/nvidia/version') or os.path.exists('/dev/nvidiactl')
+    return os.environ.get('BDGS_CUDA_ARCH', 'native' if present else None)
 
 
 class BuildNative(build_ext):
@@ -75,13 +99,27 @@ class BuildNative(build_ext):
     def build_extension(self, ext):
         """Compile one kernel; a failure costs speed, not the installation."""
         try:
-            super().build_extension(ext)
+            if ext.sources[0].endswith('.cu'):
+                self.compile_cuda(ext)
+            else:
+                super().build_extension(ext)
         except Exception as error:
             sys.stderr.write(
                 f'\n*** {ext.name} was not built ({error}).\n'
-                '*** bdgs_ros will run on its slow torch and numpy twins. For the fast kernels\n'
-                '*** install a C++17 compiler with OpenMP (Debian: apt install g++) and again.\n\n'
+                '*** bdgs_ros will run without it: on its slow torch and numpy twins, or not on a\n'
+                '*** card. For the fast kernels install a C++17 compiler with OpenMP (Debian: apt\n'
+                '*** install g++), for a card a CUDA toolkit (nvcc), and then bdgs_ros again.\n\n'
             )
+
+    def compile_cuda(self, ext):
+        """Compile and link by nvcc, whose runtime library goes into the module."""
+        path = self.get_ext_fullpath(ext.name)
+        os.makedirs(os.path.dirname(os.path.abspath(path)), exist_ok=True)
+        python = sysconfig.get_paths()['include']
+        include = [f'-I{folder}' for folder in (*ext.include_dirs, python)]
+        command = ['nvcc', '-O3', '-std=c++17', f'-arch={cuda_architecture()}', '-shared']
+        command += ['-Xcompiler', '-fPIC,-fvisibility=hidden', *include, *ext.sources]
+        subprocess.run([*command, '-o', path], check=True)
 
 
 def launchers():

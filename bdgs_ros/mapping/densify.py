@@ -8,6 +8,8 @@ large ones, which it splits; halves of the same total width do both, and change 
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +22,13 @@ Array = NDArray[np.float32]
 
 _APART = 0.6  # of the longest standard deviation, to either side
 _NARROWER = 0.8  # sqrt(1 - 0.6^2): two halves have the variance of the whole
+
+
+class Pull(Protocol):
+    """How strongly each Gaussian is pulled, as steps gather it."""
+
+    def strongest(self, count: int) -> NDArray[np.int64]:
+        """Return the `count` Gaussians that were pulled most, fewer if fewer were seen."""
 
 
 class PositionalGradient:
@@ -55,19 +64,27 @@ class PositionalGradient:
 
     def strongest(self, count: int) -> NDArray[np.int64]:
         """Return the `count` Gaussians that were pulled most, fewer if fewer were seen."""
-        mean = self._sum / np.maximum(self._views, 1)
-        count = min(count, int((mean > 0).sum()))
-        return np.argsort(-mean, kind='stable')[:count]
+        return strongest((self._sum / np.maximum(self._views, 1)).astype(np.float32), count)
+
+
+def strongest(mean: Array, count: int) -> NDArray[np.int64]:
+    """Return the `count` largest of some values that are above 0, largest first."""
+    count = min(count, int((mean > 0).sum()))
+    return np.argsort(-mean, kind='stable')[:count]
 
 
 def divide(gaussians: GaussianMap, rows: NDArray[np.int64]) -> None:
     """Divide Gaussians in two along their longest axes; everything else both halves inherit."""
-    axis = gaussians.log_scales[rows].argmax(axis=1)
-    longest = np.exp(gaussians.log_scales[rows, axis])
+    scales = gaussians.log_scales.copy()
+    axis = scales[rows].argmax(axis=1)
+    longest = np.exp(scales[rows, axis])
     direction = axes_from_quats(gaussians.quats[rows])[np.arange(len(rows)), :, axis]
     step = (np.float32(_APART) * longest)[:, None] * direction
-    gaussians.log_scales[rows, axis] += np.float32(np.log(_NARROWER))
+    scales[rows, axis] += np.float32(np.log(_NARROWER))
+    gaussians.parameters['log_scales'] = scales
     first_copy = len(gaussians)
     gaussians.copy(rows)
-    gaussians.means[rows] += step
-    gaussians.means[first_copy:] -= step
+    means = gaussians.means.copy()
+    means[rows] += step
+    means[first_copy:] -= step
+    gaussians.parameters['means'] = means

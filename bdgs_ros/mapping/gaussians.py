@@ -15,15 +15,14 @@ from bdgs_ros.belief.likelihood import Features
 from bdgs_ros.core.config import BeliefConfig
 from bdgs_ros.core.types import Pose
 from bdgs_ros.mapping.groups import Groups
-from bdgs_ros.mapping.harmonics import Shading, functions, resized
+from bdgs_ros.mapping.harmonics import resized
+from bdgs_ros.mapping.parameters import PARAMETERS, HostParameters, Parameters, ViewShading
 from bdgs_ros.mapping.rasterize import Gaussians
 from bdgs_ros.mapping.rotations import multiply, quats_from_axes
 
 Array = NDArray[np.float32]
 Scalar = TypeVar('Scalar', np.float32, np.int32, np.int64)
 
-RASTERISED = ('means', 'quats', 'log_scales', 'logit_opacities', 'colors')
-PARAMETERS = (*RASTERISED, 'harmonics')
 _RECORDS = (
     'keyframe_index',
     'observations',
@@ -54,26 +53,18 @@ class GaussianMap:
     """
     All Gaussians of the map with everything that is remembered about each.
 
-    `parameters` holds the optimised arrays by their names in `PARAMETERS`; `moments` the first
-    and second Adam moments of the same shapes; `keyframe_index` the keyframe that brought each
-    Gaussian, [N] int32; `observations` how often it was seen, [N] int32. `contribution`, `checks`
-    and `confirmations` are what pruning remembers (`bdgs_ros.mapping.prune`), not saved, as are
-    `streak` and `violations`: keyframes in a row that measured a Gaussian where it is, or looked
-    through it; `surface`, on which depth-connected surface of which keyframe it was last seen,
-    0 before. `serial`, [N] int64, is a number that no other Gaussian of this map ever has or
-    had, from 0 in order of birth, by which it can be followed while others come and go; not saved.
+    `parameters` holds the optimised arrays and their moments, on a card once something there has
+    worked on them; `keyframe_index` the keyframe that brought each Gaussian, [N] int32;
+    `observations` how often it was seen, [N] int32. `contribution`, `checks` and `confirmations`
+    are what pruning remembers (`bdgs_ros.mapping.prune`), not saved, as are `streak` and
+    `violations`: keyframes in a row that measured a Gaussian where it is, or looked through it;
+    `surface`, on which depth-connected surface of which keyframe it was last seen, 0 before.
+    `serial`, [N] int64, is a number that no other Gaussian of this map ever has or had, from 0 in
+    order of birth, by which it can be followed while others come and go; not saved.
     """
 
     def __init__(self, config: BeliefConfig, degree: int = 0) -> None:
-        self.parameters: dict[str, Array] = {
-            'means': np.zeros((0, 3), np.float32),
-            'quats': np.zeros((0, 4), np.float32),
-            'log_scales': np.zeros((0, 3), np.float32),
-            'logit_opacities': np.zeros(0, np.float32),
-            'colors': np.zeros((0, 3), np.float32),
-            'harmonics': np.zeros((0, 3 * functions(degree)), np.float32),
-        }
-        self.moments = {name: _moments_like(self.parameters[name]) for name in PARAMETERS}
+        self.parameters: Parameters = HostParameters(degree)
         self.belief = BeliefTracker(config)
         self.keyframe_index = np.zeros(0, np.int32)
         self.observations = np.zeros(0, np.int32)
@@ -136,25 +127,22 @@ class GaussianMap:
         return ~self.belief.hidden
 
     def as_gaussians(
-        self, shading: Shading | None = None, active: NDArray[np.bool_] | None = None
+        self, shading: ViewShading | None = None, active: NDArray[np.bool_] | None = None
     ) -> Gaussians:
         """Return the arrays as the rasteriser takes them; only shaded colours are not shared."""
-        arrays = {name: self.parameters[name] for name in RASTERISED}
+        arrays = self.parameters.rasterised()
         if shading is not None:
             drawn = np.ones(len(self), bool) if active is None else active
-            arrays['colors'] = shading.colors(self.colors, drawn)
+            arrays['colors'] = shading.colors(arrays['colors'], drawn)
         return Gaussians(**arrays, p_dynamic=self.p_dynamic)
 
-    def shading(self, T_camera_world: NDArray[np.float64], threads: int) -> Shading | None:
+    def shading(self, T_camera_world: NDArray[np.float64], threads: int) -> ViewShading | None:
         """Return how a camera sees the colours; None where they are the same from everywhere."""
-        if self.harmonics.shape[1] == 0:
-            return None
-        return Shading(self.means, self.harmonics, T_camera_world, threads=threads)
+        return self.parameters.shading(T_camera_world, threads)
 
     def resize_colors(self, degree: int) -> None:
         """Give the view-dependent colour another degree; what it is optimised with starts anew."""
-        self.parameters['harmonics'] = resized(self.harmonics, degree)
-        self.moments['harmonics'] = _moments_like(self.harmonics)
+        self.parameters.reset('harmonics', resized(self.harmonics, degree))
 
     def append(self, new: NewGaussians, opacity: float, keyframe_index: int) -> None:
         """Add Gaussians that came with keyframe number `keyframe_index`."""
@@ -167,11 +155,7 @@ class GaussianMap:
             'colors': new.colors,
             'harmonics': np.zeros((count, self.harmonics.shape[1])),
         }
-        for name in PARAMETERS:
-            block = added[name].astype(np.float32)
-            self.parameters[name] = _join(self.parameters[name], block)
-            old = self.moments[name]
-            self.moments[name] = [_join(m, np.zeros_like(block)) for m in old]
+        self.parameters.append(added)
         self.belief.append(new.belief)
         self.keyframe_index = _join(self.keyframe_index, np.full(count, keyframe_index, np.int32))
         none = np.zeros(count, np.int32)
@@ -190,10 +174,7 @@ class GaussianMap:
 
     def copy(self, rows: NDArray[np.int64]) -> None:
         """Add a copy of some Gaussians at the end, with optimiser state of its own."""
-        for name in PARAMETERS:
-            block = self.parameters[name][rows]
-            self.parameters[name] = _join(self.parameters[name], block)
-            self.moments[name] = [_join(m, np.zeros_like(block)) for m in self.moments[name]]
+        self.parameters.copy(rows)
         self.belief.append(self.belief.belief[rows], self.belief.smoothed[rows])
         for name in _RECORDS:
             record = getattr(self, name)
@@ -216,9 +197,7 @@ class GaussianMap:
         if mask.all():
             return
         rows = np.flatnonzero(mask)  # numpy takes rows four times as fast as it masks them
-        for name in PARAMETERS:
-            self.parameters[name] = self.parameters[name].take(rows, axis=0)
-            self.moments[name] = [m.take(rows, axis=0) for m in self.moments[name]]
+        self.parameters.take(rows)
         self.belief.keep(mask)
         for name in _RECORDS:
             setattr(self, name, getattr(self, name)[mask])
@@ -235,9 +214,7 @@ class GaussianMap:
             What the groups become, by the names in `PARAMETERS`, [M, ...] each.
 
         """
-        for name in PARAMETERS:
-            self.parameters[name] = np.ascontiguousarray(parameters[name], np.float32)
-            self.moments[name] = [m[groups.leader] for m in self.moments[name]]
+        self.parameters.pool(parameters, groups.leader)
         self.belief.pool(groups.mean)
         self.keyframe_index = groups.least(self.keyframe_index)
         self.observations = groups.most(self.observations)
@@ -274,8 +251,8 @@ class GaussianMap:
 
     def megabytes(self) -> float:
         """Return the size of the parameters and beliefs in memory, without optimiser state."""
-        arrays = [*self.parameters.values(), self.belief.belief, self.keyframe_index]
-        return sum(a.nbytes for a in arrays) / 1e6
+        arrays = [*(self.parameters[name] for name in PARAMETERS), self.belief.belief]
+        return sum(a.nbytes for a in [*arrays, self.keyframe_index]) / 1e6
 
 
 def _unturned(count: int) -> Array:
@@ -284,10 +261,6 @@ def _unturned(count: int) -> Array:
 
 def _three(scales: Array) -> Array:
     return scales if scales.ndim == 2 else np.repeat(scales[:, None], 3, axis=1)
-
-
-def _moments_like(array: Array) -> list[Array]:
-    return [np.zeros_like(array), np.zeros_like(array)]
 
 
 def _join(a: NDArray[Scalar], b: NDArray[Scalar]) -> NDArray[Scalar]:

@@ -168,17 +168,17 @@ class Shading:
 
 def basis(directions: Array, count: int) -> Array:
     """Return the first `count` functions of unit vectors, shape (3, N), as columns, [N, K]."""
-    names, coefficients = _table(count)
-    monomials = np.empty((len(names), directions.shape[1]), np.float32)
-    monomials[0] = 1
+    names, coefficients = monomials(count)
+    values = np.empty((len(names), directions.shape[1]), np.float32)
+    values[0] = 1
     for i, name in enumerate(names[1:], start=1):
-        lower = monomials[names.index(name[:-1])]
-        np.multiply(lower, directions['xyz'.index(name[-1])], out=monomials[i])
-    return np.asarray(monomials.T @ coefficients)
+        lower = values[names.index(name[:-1])]
+        np.multiply(lower, directions['xyz'.index(name[-1])], out=values[i])
+    return np.asarray(values.T @ coefficients)
 
 
 @lru_cache(maxsize=MAX_DEGREE + 1)
-def _table(count: int) -> tuple[tuple[str, ...], Array]:
+def monomials(count: int) -> tuple[tuple[str, ...], Array]:
     """Return the names of monomials, and their coefficients in the functions, [L, K]."""
     chosen = _FUNCTIONS[:count]
     degree = max((len(name) for _, terms in chosen for name in terms), default=0)

@@ -15,6 +15,7 @@ from bdgs_ros.belief.fusion import State
 from bdgs_ros.core.config.mapping import MergeConfig
 from bdgs_ros.mapping.gaussians import GaussianMap
 from bdgs_ros.mapping.groups import Groups
+from bdgs_ros.mapping.parameters import PARAMETERS
 from bdgs_ros.mapping.prune import least_useful, usefulness
 from bdgs_ros.mapping.rotations import axes_from_quats, quats_from_axes
 
@@ -82,7 +83,7 @@ def find_groups(gaussians: GaussianMap, spare: Mask, reach: float, color: float)
 def merged_parameters(gaussians: GaussianMap, groups: Groups) -> dict[str, Array]:
     """Return the parameters of each group's Gaussian, by name, [M, ...] each."""
     members = np.bincount(groups.label)
-    parameters = {name: a[groups.leader].copy() for name, a in gaussians.parameters.items()}
+    parameters = {name: gaussians.parameters[name][groups.leader] for name in PARAMETERS}
     several = members > 1
     if not several.any():
         return parameters

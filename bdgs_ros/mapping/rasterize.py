@@ -11,6 +11,7 @@ import logging
 from collections.abc import Sequence
 from functools import lru_cache
 from importlib.util import find_spec
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +34,11 @@ from bdgs_ros.mapping.rasterize_types import (
     Target,
     as_float32,
     expect_shape,
+    on_card,
 )
+
+if TYPE_CHECKING:
+    from bdgs_ros.mapping.cuda.kernels import Device
 
 __all__ = [
     'AdamGroup',
@@ -47,6 +52,7 @@ __all__ = [
     'available_backends',
     'backward',
     'fused_step',
+    'map_device',
     'render',
 ]
 
@@ -56,7 +62,7 @@ _LOGGER = logging.getLogger(__name__)
 @lru_cache(maxsize=1)
 def available_backends() -> tuple[str, ...]:
     """Return the names of the backends that run here, fastest first; 'torch' is always there."""
-    natives = tuple(v for v in VARIANTS if load_module(v) is not None)
+    natives = _cards() + tuple(v for v in VARIANTS if load_module(v) is not None)
     if find_spec('gsplat') is None:  # asked first: torch takes seconds to import
         return (*natives, 'torch')
     from bdgs_ros.mapping.rasterize_gsplat import obstacle
@@ -65,6 +71,26 @@ def available_backends() -> tuple[str, ...]:
     if reason is not None:
         _LOGGER.info('gsplat is installed but cannot be used: %s', reason)
     return (*(() if reason else ('gsplat',)), *natives, 'torch')
+
+
+def _cards() -> tuple[str, ...]:
+    """Return ('cuda',) where there is a card with kernels for it."""
+    if (
+        find_spec('bdgs_ros._rasterizer_cuda') is None
+    ):  # asked first: torch takes seconds to import
+        return ()
+    from bdgs_ros.mapping.cuda.kernels import obstacle
+
+    reason = obstacle()
+    if reason is not None:
+        _LOGGER.info('the kernels for CUDA are there but cannot be used: %s', reason)
+    return () if reason else ('cuda',)
+
+
+def map_device(backend: str) -> Device | None:
+    """Return the card that the map is optimised on; None where parameters are numpy's."""
+    chosen = _backend(backend)
+    return getattr(chosen, 'device', None)
 
 
 @lru_cache(maxsize=16)
@@ -85,15 +111,12 @@ def _backend(name: str) -> Backend:
 
 def _fastest(available: tuple[str, ...]) -> Backend:
     """Return the fastest backend that starts, and log which."""
-    if available[0] == 'gsplat':
+    if available[0] in ('cuda', 'gsplat'):
         try:
-            backend = _open('gsplat')
+            return _open(available[0])
         except MapError as error:
-            _LOGGER.warning('%s; the rasteriser runs on the CPU instead', error)
-            available = available[1:]
-        else:
-            _LOGGER.info('rasteriser: gsplat, for there is a CUDA device')
-            return backend
+            _LOGGER.warning('%s; the map stays on the CPU instead', error)
+            return _fastest(available[1:])
     if available[0] == 'torch':
         _LOGGER.warning(
             'no compiled rasteriser: using its torch twin, about 100 times slower; '
@@ -106,6 +129,11 @@ def _fastest(available: tuple[str, ...]) -> Backend:
 
 def _open(name: str) -> Backend:
     """Start one of `available_backends()`; torch, which takes seconds to import, only if used."""
+    if name == 'cuda':
+        from bdgs_ros.mapping.cuda.backend import CudaBackend
+        from bdgs_ros.mapping.cuda.kernels import device
+
+        return CudaBackend(device())
     if name == 'gsplat':
         from bdgs_ros.mapping.rasterize_gsplat import GsplatBackend
 
@@ -161,8 +189,9 @@ def render(
         If the backend cannot run here.
 
     """
-    scene = _scene(g, T_camera_world, camera, active, threads)
-    return _backend(backend).render(scene, statistics)
+    chosen = _backend(backend)
+    scene = _scene(g, T_camera_world, camera, active, threads, chosen)
+    return chosen.render(scene, statistics)
 
 
 def backward(
@@ -201,13 +230,14 @@ def backward(
         If the backend cannot run here.
 
     """
-    scene = _scene(g, T_camera_world, camera, active, threads)
+    chosen = _backend(backend)
+    scene = _scene(g, T_camera_world, camera, active, threads, chosen)
     images = (
         as_float32('dL_dcolor', dL_dcolor, (*camera.shape, 3)),
         as_float32('dL_ddepth', dL_ddepth, camera.shape),
         as_float32('dL_dsilhouette', dL_dsilhouette, camera.shape),
     )
-    return _backend(backend).backward(scene, images)
+    return chosen.backward(scene, images)
 
 
 def fused_step(
@@ -265,14 +295,15 @@ def fused_step(
         If the backend cannot run here.
 
     """
-    scene = _scene(g, T_camera_world, camera, active, threads)
+    chosen = _backend(backend)
+    scene = _scene(g, T_camera_world, camera, active, threads, chosen)
     target = Target(
         as_float32('target_color', target_color, (*camera.shape, 3)),
         as_float32('target_depth', target_depth, camera.shape),
         as_float32('pixel_weight', pixel_weight, camera.shape),
         (float(exposure[0]), float(exposure[1])),
     )
-    return _backend(backend).fused_step(scene, target, weights, with_images)
+    return chosen.fused_step(scene, target, weights, with_images)
 
 
 def adam_step(
@@ -405,12 +436,14 @@ def _scene(
     camera: PinholeCamera,
     active: NDArray[np.bool_] | None,
     threads: int,
+    backend: Backend,
 ) -> Scene:
     count = len(g.means)
     shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, 3), (count,))
     names = ('means', 'quats', 'log_scales', 'logit_opacities', 'colors', 'p_dynamic')
+    check = on_card if hasattr(backend, 'device') else as_float32
     arrays = [
-        as_float32(f'g.{name}', array, shape)
+        check(f'g.{name}', array, shape)
         for name, array, shape in zip(names, g.arrays(), shapes, strict=True)
     ]
     expect_shape('T_camera_world', T_camera_world, (4, 4))

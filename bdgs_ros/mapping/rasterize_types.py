@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -183,13 +183,23 @@ class Backend(Protocol):
         """Render, compare and differentiate."""
 
 
-def expect_shape(name: str, array: NDArray[np.generic], shape: Sequence[int]) -> None:
+def expect_shape(name: str, array: Any, shape: Sequence[int]) -> None:
     """Raise ValueError naming the argument unless `array` has `shape`."""
-    if array.shape != tuple(shape):
+    if tuple(array.shape) != tuple(shape):
         raise ValueError(f'{name}: expected shape {tuple(shape)}, received {array.shape}')
 
 
-def as_float32(name: str, array: NDArray[np.floating], shape: Sequence[int]) -> Array:
+def on_card(name: str, array: Any, shape: Sequence[int]) -> Any:
+    """Return a tensor as it is, and anything else by `as_float32`; refuse another shape."""
+    if isinstance(array, np.ndarray):
+        return as_float32(name, array, shape)
+    expect_shape(name, array, shape)
+    return array
+
+
+def as_float32(name: str, array: Any, shape: Sequence[int]) -> Array:
     """Return `array` as rows of float32, copied only if it is not; refuse another shape."""
     expect_shape(name, array, shape)
+    if not isinstance(array, np.ndarray):  # a tensor, perhaps of a card
+        array = array.detach().cpu().numpy()
     return np.ascontiguousarray(array, dtype=np.float32)

@@ -8,7 +8,7 @@ import numpy as np
 
 from bdgs_ros.core.config import MappingConfig
 from bdgs_ros.core.errors import MapError
-from bdgs_ros.mapping.densify import PositionalGradient, divide
+from bdgs_ros.mapping.densify import divide
 from bdgs_ros.mapping.gaussians import GaussianMap
 from bdgs_ros.mapping.keyframes import MapKeyframe
 from bdgs_ros.mapping.optimise import Optimiser
@@ -82,15 +82,14 @@ class Refiner:
         self._densified += 1
         room = self._config.prune.max_gaussians - len(self._map)
         wanted = round(self._config.densify.share * len(self._map))
-        pull = self._optimiser.pull
-        if pull is not None and room > 0:
-            divide(self._map, pull.strongest(min(wanted, room)))
+        if self._pull is not None and room > 0:
+            divide(self._map, self._pull.strongest(min(wanted, room)))
         self._gather()
 
     def _gather(self) -> None:
         """Gather gradients for the next round, if there is one."""
         more = self._densified < self._config.densify.rounds
-        self._optimiser.pull = PositionalGradient(len(self._map)) if more else None
+        self._pull = self._optimiser.gather(len(self._map) if more else None)
 
     def _next_keyframe(self) -> MapKeyframe:
         """Return keyframes in random order, each once before any comes again."""

@@ -318,7 +318,7 @@ def test_rasterizer_rows_have_every_column(tmp_path):
     settings = {'gaussians': 300, 'width': 32, 'height': 24, 'backend': 'auto', 'threads': 1}
     cell = Cell('small', 'auto_1', 0, settings)
     row = rasterizer.run_cell(cell, Options(tmp_path, tmp_path))
-    times = ['forward_ms', 'backward_ms', 'fused_ms', 'iteration_ms']
+    times = ['forward_ms', 'backward_ms', 'fused_ms', 'step_ms']
     assert list(row) == [
         'gaussians', 'width', 'height', 'threads', 'backend', *times, 'gradient_error',
     ]  # fmt: skip

@@ -7,6 +7,7 @@ from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.config import BeliefConfig
 from bdgs_ros.mapping.gaussians import GaussianMap, NewGaussians
 from bdgs_ros.mapping.groups import Groups
+from bdgs_ros.mapping.parameters import PARAMETERS
 from bdgs_ros.mapping.rasterize import render
 
 CAMERA = PinholeCamera(64, 48, 60.0, 60.0, 31.5, 23.5)
@@ -58,7 +59,7 @@ def test_serial_numbers_are_never_given_twice() -> None:
     assert gaussians.serial.tolist() == [0, 2, 3, 5, 6]
     gaussians.pool(
         Groups(np.array([0, 1, 0, 1, 1]), np.array([2, 1]), np.ones(5, np.float32)),
-        {name: values[:2] for name, values in gaussians.parameters.items()},
+        {name: gaussians.parameters[name][:2] for name in PARAMETERS},
     )
     assert gaussians.serial.tolist() == [3, 2]  # those of the heaviest members
     assert gaussians.serial.dtype == np.int64

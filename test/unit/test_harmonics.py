@@ -235,7 +235,9 @@ def test_files_keep_it_in_the_layout_of_3dgs(tmp_path: Path) -> None:
     for degree, count in ((None, 24), (0, 0), (1, 9), (2, 24), (3, 45)):
         loaded = load_ply(tmp_path / 'map.ply', BeliefConfig(), degree)
         assert loaded.harmonics.shape == (len(original), count)
-        assert [m.shape for m in loaded.moments['harmonics']] == 2 * [loaded.harmonics.shape]
+        assert [m.shape for m in loaded.parameters.moments['harmonics']] == 2 * [
+            loaded.harmonics.shape
+        ]
         expected = harmonics.resized(original.harmonics, degree_of_count(count))
         np.testing.assert_array_equal(loaded.harmonics, expected)
         np.testing.assert_allclose(loaded.colors, original.colors, atol=1e-6)

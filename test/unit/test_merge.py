@@ -85,5 +85,5 @@ def test_two_become_the_gaussian_with_their_moments() -> None:
     np.testing.assert_allclose(gaussians.belief.belief, [0.04], atol=1e-4)
     assert gaussians.keyframe_index.tolist() == [4]
     assert gaussians.observations.tolist() == [9]
-    assert len(gaussians.moments['means'][0]) == 1
+    assert len(gaussians.parameters.moments['means'][0]) == 1
     assert gaussians.belief.hidden.tolist() == [False]

@@ -7,7 +7,8 @@ import pytest
 
 from bdgs_ros.core.config import BeliefConfig
 from bdgs_ros.core.errors import MapError
-from bdgs_ros.mapping.gaussians import PARAMETERS, GaussianMap, NewGaussians
+from bdgs_ros.mapping.gaussians import GaussianMap, NewGaussians
+from bdgs_ros.mapping.parameters import PARAMETERS
 from bdgs_ros.mapping.ply import STANDARD, STATE, load_ply, save_ply, write_points
 
 CONFIG = BeliefConfig()

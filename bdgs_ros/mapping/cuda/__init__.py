@@ -1,0 +1,1 @@
+"""The map on an NVIDIA card: rasteriser, parameters and optimisation that never leave it."""
