@@ -106,9 +106,9 @@ class BuildNative(build_ext):
         except Exception as error:
             sys.stderr.write(
                 f'\n*** {ext.name} was not built ({error}).\n'
-                '*** bdgs_ros will run without it: on its slow torch and numpy twins, or not on a\n'
-                '*** card. For the fast kernels install a C++17 compiler with OpenMP (Debian: apt\n'
-                '*** install g++), for a card a CUDA toolkit (nvcc), and then bdgs_ros again.\n\n'
+                '*** bdgs_ros will run without it, on its slow twins or not on a card. For fast\n'
+                '*** kernels install a C++17 compiler with OpenMP (Debian: apt install g++), for\n'
+                '*** a card a CUDA toolkit (nvcc), and then bdgs_ros again.\n\n'
             )
 
     def compile_cuda(self, ext):

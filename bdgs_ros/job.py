@@ -6,10 +6,12 @@ import sys
 import time
 from collections import abc
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from bdgs_ros.ahead import DetectedAhead
 from bdgs_ros.core.config import BdgsConfig
 from bdgs_ros.core.errors import DatasetError
 from bdgs_ros.core.types import Pose, RgbdFrame
@@ -19,7 +21,7 @@ from bdgs_ros.data.synth.truth import SynthTruth
 from bdgs_ros.eval.metric import Metric
 from bdgs_ros.eval.pictures import write_posterior
 from bdgs_ros.eval.posterior import PosteriorWatch
-from bdgs_ros.eval.recorder import Recorder
+from bdgs_ros.eval.recorder import Recorder, RunResult
 from bdgs_ros.eval.scores import Truth
 from bdgs_ros.runner import LabelObserver, Observer, run_sequence, write_results
 
@@ -96,13 +98,10 @@ def run_job(
         slam.start_from(job.map_file, sequence.camera, job.start_pose, localise=job.localise)
     start = time.perf_counter()
     watching = [watch for watch in (labels, posterior) if watch is not None]
-    result = run_sequence(
-        _with_progress(sequence, chosen, job.progress),
-        slam,
-        [*watching, *observers],
-        Recorder(job.samples),
-    )
+    frames = _with_progress(sequence, chosen, job.progress)
+    result = _run(frames, slam, [*watching, *observers], Recorder(job.samples))
     wall_s = time.perf_counter() - start
+    rate = Metric('frames_per_s', len(result.rows) / wall_s, 'Hz')
     metrics = write_results(
         job.output,
         result,
@@ -110,7 +109,7 @@ def run_job(
         name=sequence.name,
         ground_truth=sequence.ground_truth,
         truth=truth,
-        more=[*([] if labels is None else labels.score.metrics()), *more()],
+        more=[rate, *([] if labels is None else labels.score.metrics()), *more()],
         config=job.config,
         extra={'frames': [chosen.start, chosen.stop], 'wall_s': wall_s},
         keep_keyframes=job.keyframes,
@@ -119,6 +118,19 @@ def run_job(
     if posterior is not None and posterior.samples:
         write_posterior(job.output / 'posterior.png', posterior.samples)
     return metrics
+
+
+def _run(
+    frames: Iterable[RgbdFrame], slam: Any, observers: list[Observer], recorder: Recorder
+) -> RunResult:
+    """Run all frames, labelled ahead."""
+    stage = slam.detection
+    slam.detection = ahead = DetectedAhead(stage)
+    try:
+        with closing(ahead.frames(frames)) as labelled:
+            return run_sequence(labelled, slam, observers, recorder)
+    finally:
+        slam.detection = stage
 
 
 def _open(job: Job) -> tuple[Sequence, Truth | None]:
