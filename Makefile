@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: install demo test check bench cuda-check clean
+.PHONY: install demo test check bench cuda-check wheels clean
 
 install: $(STAMP)
 
@@ -31,10 +31,17 @@ bench: install
 	$(BIN)/bdgs bench rasterizer
 	$(BIN)/bdgs bench mapping
 
-cuda-check: install
-	BDGS_REQUIRE_CUDA=1 $(BIN)/python3 -m pytest test/unit/test_rasterize_gsplat.py \
-		test/unit/test_rasterize.py test/unit/test_detection_onnx.py
+# WHEELS=folder where there is no network: what is not installed comes from there, torch from the
+# Python that makes the environment
+cuda-check: $(if $(WHEELS),wheels,install)
+	BDGS_REQUIRE_CUDA=1 $(BIN)/python3 -m pytest test/unit/test_rasterize_cuda.py \
+		test/unit/test_cuda_steps.py test/unit/test_rasterize.py test/unit/test_detection_onnx.py
 	$(BIN)/bdgs bench rasterizer
+	$(BIN)/bdgs bench card
+
+wheels:
+	test -x $(BIN)/python3 || $(PYTHON) -m venv --system-site-packages $(VENV)
+	$(BIN)/python3 -m pip install -q --no-index --find-links $(WHEELS) --no-build-isolation -e .
 
 clean:
 	rm -rf build demo *.egg-info bdgs_ros/*.so

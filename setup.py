@@ -177,8 +177,6 @@ setup(
     extras_require={
         # rclpy from pip; leave it out in a ROS 2 workspace, which brings its own
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
-        # the rasteriser on an NVIDIA card: docs/cuda.md
-        'cuda': ['gsplat>=1.5.3,<2', 'setuptools'],
         'test': ['pytest', 'mypy', 'ruff', 'evo', 'cyclonedds', 'psutil'],
     },
     zip_safe=False,

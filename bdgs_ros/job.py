@@ -101,7 +101,6 @@ def run_job(
     frames = _with_progress(sequence, chosen, job.progress)
     result = _run(frames, slam, [*watching, *observers], Recorder(job.samples))
     wall_s = time.perf_counter() - start
-    rate = Metric('frames_per_s', len(result.rows) / wall_s, 'Hz')
     metrics = write_results(
         job.output,
         result,
@@ -109,7 +108,7 @@ def run_job(
         name=sequence.name,
         ground_truth=sequence.ground_truth,
         truth=truth,
-        more=[rate, *([] if labels is None else labels.score.metrics()), *more()],
+        more=[*([] if labels is None else labels.score.metrics()), *more()],
         config=job.config,
         extra={'frames': [chosen.start, chosen.stop], 'wall_s': wall_s},
         keep_keyframes=job.keyframes,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -57,6 +58,7 @@ _COLUMNS = {
     'mapping_ms': 'mapping_median',
     'mapping_p95_ms': 'mapping_p95',
     'tracking_ms': 'tracking_median',
+    'frames_per_s': 'frames_per_s',
 }
 
 
@@ -120,7 +122,7 @@ def _loop(options: Options) -> int:
 
 def run_cell(cell: Cell, options: Options) -> dict[str, Any]:
     """Run one recording; results and pictures stay in the work folder."""
-    return (_run_long if cell.sequence.startswith(_LOOP) else _run_quality)(cell, options)
+    return (_run_long if cell.sequence.startswith(_LOOP) else run_quality)(cell, options)
 
 
 @dataclass(frozen=True)
@@ -152,7 +154,9 @@ def _open(cell: Cell, options: Options) -> _Opened:
     return _Opened(sequence, open_truth(path), frames)
 
 
-def _run_quality(cell: Cell, options: Options) -> dict[str, Any]:
+def run_quality(cell: Cell, options: Options) -> dict[str, Any]:
+    """Run a recording, score the map on the way, at its end and refined."""
+    from bdgs_ros.ahead import DetectedAhead
     from bdgs_ros.eval import memory
     from bdgs_ros.eval.lpips import find_lpips
     from bdgs_ros.eval.recorder import Recorder
@@ -163,11 +167,13 @@ def _run_quality(cell: Cell, options: Options) -> dict[str, Any]:
     opened = _open(cell, options)
     folder = options.work / 'runs' / cell.key
     slam: Any = BdgsSlam(config)
-    slam.detection = map_quality.LastLabels(slam.detection)
+    ahead = DetectedAhead(slam.detection)
+    slam.detection = map_quality.LastLabels(ahead)
     scorer = map_quality.Scorer(opened.truth)
     watch = map_quality.LiveScores(slam.mapper, slam.detection, scorer)
     memory.restart_peak()
-    result = run_sequence(opened, slam, [watch], Recorder(max_samples=0))
+    with closing(ahead.frames(opened)) as frames:
+        result = run_sequence(frames, slam, [watch], Recorder(max_samples=0))
     row: dict[str, Any] = {'peak_rss_mb': memory.peak_mb()}
     metrics = write_results(
         folder,

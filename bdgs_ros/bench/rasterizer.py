@@ -47,9 +47,8 @@ def cells(options: Options) -> list[Cell]:
     counts = (2_000,) if options.quick else _COUNTS
     sizes = ((160, 120),) if options.quick else _SIZES
     available = rasterize.available_backends()
-    cards = ('cuda', 'gsplat')
-    native = [name for name in available if name not in (*cards, 'torch')][:1]
-    card = [name for name in available if name in cards]
+    native = [name for name in available if name not in ('cuda', 'torch')][:1]
+    card = [name for name in available if name == 'cuda']
     found = []
     for width, height in sizes:
         for count in counts:
@@ -127,7 +126,7 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         if size == (50_000, 320, 240) and row['backend'] != 'torch':
             for what in ('fused', 'step'):
                 name = f'{what}_ms_50k_320x240_{row["threads"]}_threads'
-                suffix = f'_{row["backend"]}' if row['backend'] in ('cuda', 'gsplat') else ''
+                suffix = '_cuda' if row['backend'] == 'cuda' else ''
                 summary[name + suffix] = row.get(f'{what}_ms')
     errors = [row['gradient_error'] for row in rows if row['gradient_error'] is not None]
     if errors:

@@ -17,7 +17,7 @@ from bdgs_ros.eval.metric import dump_json
 NAME = 'bench'
 HELP = 'measure accuracy or speed; finished cells are kept, so an interrupted bench goes on'
 
-_BENCHES = ('slam', 'accuracy', 'belief', 'mapping', 'tracking', 'recovery', 'rasterizer')
+_BENCHES = ('slam', 'accuracy', 'belief', 'mapping', 'tracking', 'recovery', 'rasterizer', 'card')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -55,6 +55,8 @@ class RunResult:
 
     rows: tuple[FrameRow, ...]
     samples: tuple[Sample, ...]
+    seconds: float | None = None
+    """That the run took, reading included and what observers did left out; None if unknown."""
 
     @property
     def trajectory(self) -> Trajectory:
@@ -87,6 +89,8 @@ class RunResult:
                 Metric(f'{part}_median', float(median), 'ms'),
                 Metric(f'{part}_p95', float(p95), 'ms'),
             ]
+        if self.seconds:
+            metrics.append(Metric('frames_per_s', len(self.rows) / self.seconds, 'Hz'))
         return metrics
 
 
@@ -132,7 +136,15 @@ class Recorder:
             self.samples = self.samples[::2]
             self._stride *= 2
 
-    def result(self) -> RunResult:
-        """Return what has been collected so far; samples without a pose are left out."""
+    def result(self, seconds: float | None = None) -> RunResult:
+        """
+        Return what has been collected so far; samples without a pose are left out.
+
+        Parameters
+        ----------
+        seconds : float, optional
+            See `RunResult`.
+
+        """
         kept = tuple(s for s in self.samples if np.isfinite(s.T_world_camera).all())
-        return RunResult(tuple(self.rows), kept)
+        return RunResult(tuple(self.rows), kept, seconds)

@@ -1,8 +1,9 @@
 """
 Render Gaussians and differentiate the rendering, by the fastest backend that runs here.
 
-The native backend is `src/rasterizer.cpp`, which explains the algorithm; its readable twin is
-`rasterize_torch`, which the tests hold it to and which serves where nothing was compiled.
+The native backend is `src/rasterizer.cpp`, which explains the algorithm; that for a card is
+`src/cuda`. The readable twin of both is `rasterize_torch`, which the tests hold them to and which
+serves where nothing was compiled.
 """
 
 from __future__ import annotations
@@ -62,22 +63,13 @@ _LOGGER = logging.getLogger(__name__)
 @lru_cache(maxsize=1)
 def available_backends() -> tuple[str, ...]:
     """Return the names of the backends that run here, fastest first; 'torch' is always there."""
-    natives = _cards() + tuple(v for v in VARIANTS if load_module(v) is not None)
-    if find_spec('gsplat') is None:  # asked first: torch takes seconds to import
-        return (*natives, 'torch')
-    from bdgs_ros.mapping.rasterize_gsplat import obstacle
-
-    reason = obstacle()
-    if reason is not None:
-        _LOGGER.info('gsplat is installed but cannot be used: %s', reason)
-    return (*(() if reason else ('gsplat',)), *natives, 'torch')
+    natives = tuple(v for v in VARIANTS if load_module(v) is not None)
+    return (*_cards(), *natives, 'torch')
 
 
 def _cards() -> tuple[str, ...]:
     """Return ('cuda',) where there is a card with kernels for it."""
-    if (
-        find_spec('bdgs_ros._rasterizer_cuda') is None
-    ):  # asked first: torch takes seconds to import
+    if find_spec('bdgs_ros._rasterizer_cuda') is None:  # asked first: torch loads for seconds
         return ()
     from bdgs_ros.mapping.cuda.kernels import obstacle
 
@@ -111,7 +103,7 @@ def _backend(name: str) -> Backend:
 
 def _fastest(available: tuple[str, ...]) -> Backend:
     """Return the fastest backend that starts, and log which."""
-    if available[0] in ('cuda', 'gsplat'):
+    if available[0] == 'cuda':
         try:
             return _open(available[0])
         except MapError as error:
@@ -134,10 +126,6 @@ def _open(name: str) -> Backend:
         from bdgs_ros.mapping.cuda.kernels import device
 
         return CudaBackend(device())
-    if name == 'gsplat':
-        from bdgs_ros.mapping.rasterize_gsplat import GsplatBackend
-
-        return GsplatBackend()
     if name == 'torch':
         from bdgs_ros.mapping.rasterize_torch import TorchBackend
 
@@ -390,21 +378,15 @@ def adam_steps(
         expect_shape('rows', rows, groups[0].params.shape[:1])
         rows = np.ascontiguousarray(rows, dtype=np.bool_)
     constants = AdamConstants(step or 0, betas, eps)
-    chosen = _adam_backend(backend)
-    if isinstance(chosen, NativeBackend):
-        chosen.adam_steps(checked, rows, constants, threads)
+    natives = [
+        v for v in VARIANTS if load_module(v) is not None and backend in (v, 'native', 'auto')
+    ]
+    native = _backend(natives[0]) if natives else None
+    if isinstance(native, NativeBackend):
+        native.adam_steps(checked, rows, constants, threads)
     else:
         for group in checked:
             _adam_numpy(group, rows, constants)
-
-
-def _adam_backend(name: str) -> Backend:
-    """Return who makes Adam's steps: parameters live on the CPU, also where a GPU rasterises."""
-    chosen = _backend(name)
-    natives = [v for v in available_backends() if v in VARIANTS]
-    if isinstance(chosen, NativeBackend) or name == 'torch' or not natives:
-        return chosen
-    return _backend(natives[0])
 
 
 def _checked(group: AdamGroup) -> AdamGroup:

@@ -40,7 +40,7 @@ T_CAMERA_WORLD = se3.exp(np.array([0.1, -0.2, 0.3, 0.2, -0.3, 0.4]))
 WEIGHTS = LossWeights(color=0.85, ssim=0.2, depth=0.3, smooth=0.4, empty=0.1)
 EXPOSURE = (0.1, -0.02)
 NATIVES = [name for name in available_backends() if name in VARIANTS]
-ON_CPU = [*NATIVES, 'torch']  # gsplat, less exact by design, has tests of its own
+ON_CPU = [*NATIVES, 'torch']  # a card has tests of its own
 PARAMETERS = ('means', 'quats', 'log_scales', 'logit_opacities', 'colors')
 
 native = pytest.mark.skipif(not NATIVES, reason='no native rasteriser was built')
@@ -463,8 +463,8 @@ def test_wrong_shapes_and_values_are_named() -> None:
 
 def test_unknown_backend_is_refused() -> None:
     """The error lists what there is."""
-    with pytest.raises(MapError, match=r"'cuda'.*torch"):
-        render(make_gaussians(1), np.eye(4), CAMERA, backend='cuda')
+    with pytest.raises(MapError, match=r"'metal'.*torch"):
+        render(make_gaussians(1), np.eye(4), CAMERA, backend='metal')
 
 
 def test_without_native_build_the_twin_serves(

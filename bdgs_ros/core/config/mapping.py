@@ -185,7 +185,7 @@ class MappingConfig:
         2, 'of the rasteriser; in real time one processor is left to tracking', low=1, high=64
     )
     backend: str = param(
-        'auto', 'rasteriser; gsplat needs CUDA', choices=('auto', 'gsplat', 'native', 'torch')
+        'auto', 'rasteriser, and where the map lives', choices=('auto', 'cuda', 'native', 'torch')
     )
     seed: int = param(0, 'of the choice of keyframes', low=0)
     loss: LossConfig = field(default_factory=LossConfig)
