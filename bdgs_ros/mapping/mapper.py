@@ -157,10 +157,22 @@ class Mapper:
         if early is not None:
             early(self._answer(current, level.camera))
         self._optimiser.run(self.map, current, companions)
+        self._settle()
         self._thin()
         if early is not None and self._hurried():
             return None
         return self._answer(current, level.camera)
+
+    def _settle(self) -> None:
+        """Fit the map to all keyframes, so that it does not follow the newest ones alone."""
+        if self._config.settle:
+            views = [self._any_keyframe(i) for i in range(self._config.settle)]
+            self._optimiser.settle(self.map, views, self._config.settle_rate)
+
+    def _any_keyframe(self, turn: int) -> MapKeyframe:
+        """Return a keyframe at random: in turn one of the window, or of all."""
+        among = self.keyframes[-self._config.window :] if turn % 2 else self.keyframes
+        return among[self._rng.integers(len(among))]
 
     def polish(self, most: int) -> bool:
         """
@@ -179,8 +191,7 @@ class Mapper:
         """
         if not self.grows or not self.keyframes or self._polished >= most:
             return False
-        among = self.keyframes[-self._config.window :] if self._polished % 2 else self.keyframes
-        keyframe = among[self._rng.integers(len(among))]
+        keyframe = self._any_keyframe(self._polished)
         self._optimiser.step(self.map, keyframe, 0, move=False)
         self._polished += 1
         return self._polished < most

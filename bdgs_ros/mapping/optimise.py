@@ -130,6 +130,30 @@ class Optimiser:
         self._steps.end()
         return self._steps.losses()[-1]
 
+    def settle(
+        self, gaussians: GaussianMap, views: Sequence[MapKeyframe], rate_scale: float
+    ) -> None:
+        """
+        Take a step on each of some views, whose poses stay.
+
+        Parameters
+        ----------
+        gaussians : GaussianMap
+            Changed in place.
+        views : sequence of MapKeyframe
+            In this order, at the finest level, until the next keyframe waits.
+        rate_scale : float
+            Factor on every learning rate.
+
+        """
+        self._steps.begin(gaussians, views)
+        for keyframe in views:
+            if self._hurried():
+                break
+            window = self._look(keyframe, 0)
+            self._steps.take(keyframe, 0, window, rate_scale=rate_scale, pose_scale=0.0)
+        self._steps.end()
+
     def _plan(self, newest: MapKeyframe, others: Sequence[MapKeyframe]) -> tuple[Plan, Plan]:
         """Return keyframe and pyramid level of each iteration: coarse ones, finest ones."""
         levels = self._levels(len(newest.levels))

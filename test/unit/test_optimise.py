@@ -163,3 +163,14 @@ def test_exposure_is_fitted_except_for_the_first_keyframe() -> None:
         keyframe.levels = brighter
         Optimiser(CONFIG).run(gaussians, keyframe, [])
         assert (abs(keyframe.exposure[0]) > 0.005) == moves
+
+
+def test_settling_moves_the_map_and_no_keyframe_and_ends_when_one_waits() -> None:
+    gaussians, keyframe = scene()
+    before, pose = gaussians.colors.copy(), keyframe.T_world_camera.copy()
+    waits = iter([False, False, True])
+    optimiser = Optimiser(CONFIG, lambda: next(waits))
+    optimiser.settle(gaussians, [keyframe] * 5, 0.5)
+    assert len(optimiser._steps.losses()) == 2
+    assert np.abs(gaussians.colors - before).max() > 1e-3
+    np.testing.assert_array_equal(keyframe.T_world_camera, pose)

@@ -171,6 +171,10 @@ class MappingConfig:
     hurried: int = param(
         4, 'iterations while the next keyframe waits (realtime)', low=0, high=1000
     )
+    settle: int = param(
+        0, 'steps on all keyframes after those of each keyframe', low=0, high=10000
+    )
+    settle_rate: float = param(0.4, 'share of the learning rates in these', low=0.0, high=1.0)
     spare: int = param(
         20,
         'more iterations per keyframe for each processor beyond two, while none waits (realtime)',
