@@ -17,6 +17,7 @@ from typing import Any, Protocol
 from bdgs_ros.core.config import BdgsConfig, specs
 from bdgs_ros.core.errors import EvaluationError
 from bdgs_ros.core.files import write_text
+from bdgs_ros.core.threads import one_thread_in_cv2
 from bdgs_ros.core.types import RgbdFrame, TrackingResult, Trajectory
 from bdgs_ros.data.trajectory_io import write_trajectory
 from bdgs_ros.eval import pictures, plots, provenance, scores, trajectory
@@ -117,6 +118,7 @@ def run_sequence(
         `mapping` (keyframes alone) and `frame`, all of them together.
 
     """
+    one_thread_in_cv2()
     recorder = Recorder() if recorder is None else recorder
     times_ms: dict[str, float] = {}
     stages = slam.detection, slam.tracker, slam.back_end, slam.mapper

@@ -11,6 +11,8 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing.connection import wait
 
+from bdgs_ros.core.threads import one_thread_in_cv2
+
 _ONE_THREAD = ('OMP_NUM_THREADS', 'OMP_THREAD_LIMIT', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
 
 
@@ -47,10 +49,8 @@ def _restore(environment: dict[str, str | None]) -> None:
 
 
 def _start() -> None:
-    import cv2
-
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears it and clears up
-    cv2.setNumThreads(1)
+    one_thread_in_cv2()
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 

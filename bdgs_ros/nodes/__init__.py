@@ -2,8 +2,9 @@
 
 import os
 
-# Read by OpenBLAS when it is loaded: the other nodes need the other processors.
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+from bdgs_ros.core.threads import one_thread_in_blas
+
+one_thread_in_blas()
 
 MEMORY = ':'.join(
     (

@@ -7,7 +7,6 @@ import sys
 from functools import partial
 from typing import Any
 
-import cv2
 import numpy as np
 from sensor_msgs.msg import Image
 from std_msgs.msg import Empty
@@ -21,6 +20,7 @@ from bdgs_ros.bridge.pace import LabelsPace
 from bdgs_ros.bridge.runner import GraphNode, run
 from bdgs_ros.bridge.worker import Worker
 from bdgs_ros.core.errors import DatasetError
+from bdgs_ros.core.threads import one_thread_in_cv2
 from bdgs_ros.core.types import Labels
 from bdgs_ros.detection.late import AtOnce, InBackground
 from bdgs_ros.detection.stage import DetectionStage
@@ -34,7 +34,7 @@ class DetectionNode(GraphNode):
     def __init__(self, **options: Any) -> None:
         super().__init__('detection_node', **options)
         config = parameters.declare(self, DetectionNodeConfig())
-        cv2.setNumThreads(1)
+        one_thread_in_cv2()
         self.nice = config.detection_nice
         self._health = Health(self, 'detection')
         # In real time the network has a thread of its own and the newest image, and labels come

@@ -9,7 +9,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-import cv2
 import numpy as np
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path as PathMessage
@@ -34,6 +33,7 @@ from bdgs_ros.bridge.worker import Worker
 from bdgs_ros.core.config import MappingConfig
 from bdgs_ros.core.errors import BdgsError
 from bdgs_ros.core.images import fitted, halved
+from bdgs_ros.core.threads import one_thread_in_cv2
 from bdgs_ros.core.types import (
     Keyframe,
     Labels,
@@ -65,7 +65,7 @@ class MappingNode(GraphNode):
     def __init__(self, **options: Any) -> None:
         super().__init__('mapping_node', **options)
         config = parameters.declare(self, MappingNodeConfig(), runtime=AT_RUN_TIME)
-        cv2.setNumThreads(1)
+        one_thread_in_cv2()
         self.nice = config.back_end_nice  # which waits for the images of its keyframes
         self._config = config
         self._health = Health(self, 'mapping')

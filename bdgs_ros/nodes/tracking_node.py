@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 from diagnostic_msgs.msg import DiagnosticArray
 from std_msgs.msg import Empty
 
@@ -27,6 +26,7 @@ from bdgs_ros.bridge.status import FrameState, FrameStatus, status_to_message
 from bdgs_ros.bridge.worker import Worker
 from bdgs_ros.core.errors import ConfigError, DatasetError, MapError
 from bdgs_ros.core.images import fitted, halved
+from bdgs_ros.core.threads import one_thread_in_cv2
 from bdgs_ros.core.types import Keyframe, RgbdFrame, TrackingResult, TrackingStatus
 from bdgs_ros.data.trajectory_io import write_trajectory
 from bdgs_ros.mapping.map_files import load_places
@@ -42,7 +42,7 @@ class TrackingNode(GraphNode):
     def __init__(self, **options: Any) -> None:
         super().__init__('tracking_node', **options)
         config = parameters.declare(self, TrackingNodeConfig(), runtime=_AT_RUN_TIME)
-        cv2.setNumThreads(1)
+        one_thread_in_cv2()
         keep_to(config.tracking_cpus)
         self._config = config
         self._paused = False

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bdgs_ros.core.errors import DatasetError
+from bdgs_ros.core.threads import one_thread_in_cv2
 from bdgs_ros.data.synth.lists import write_lists, write_objects
 from bdgs_ros.data.synth.plan import RecordingPlan
 from bdgs_ros.data.synth.render import FrameImages, FrameRenderer
@@ -134,7 +135,7 @@ _worker: FrameWorker | None = None  # of this process, set by `_start`
 def _start(plan: RecordingPlan, folder: Path) -> None:
     global _worker
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears it and clears up
-    cv2.setNumThreads(1)
+    one_thread_in_cv2()
     _worker = FrameWorker(plan, folder)
 
 
