@@ -22,7 +22,7 @@ _SHOWN = (
     'dynamic_false_positive_rate', 'psnr', 'psnr_exposure_fit', 'psnr_map', 'psnr_hidden',
     'psnr_rest', 'ssim', 'depth_l1',
     'gaussians', 'map_size', 'detection_median', 'tracking_median', 'tracking_p95',
-    'mapping_median', 'mapping_p95', 'frame_median',
+    'mapping_median', 'mapping_p95', 'frames_per_s',
 )  # fmt: skip
 
 
