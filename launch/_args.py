@@ -32,7 +32,8 @@ GRAPH_ARGUMENTS = (
     ('load_at_start', 'false', 'begin in the map of map_file, if it exists, and go on mapping'),
     ('localization', 'false', 'begin in the map of map_file and leave it as it is'),
     ('start_pose', '', 'about where the camera starts in that map: x y z qx qy qz qw'),
-    ('trajectory_file', '', 'where bdgs/save_trajectory writes'),
+    ('trajectory_file', '', 'where bdgs/save_trajectory writes, and the end of the node'),
+    ('final_trajectory_file', '', 'the same of bdgs/save_final_trajectory'),
     ('use_sim_time', 'false', 'take the time from /clock'),
     ('rviz', 'false', 'open rviz with a view of map, pose and renders'),
 )
@@ -87,6 +88,7 @@ def _parameters():
             'localization': _value('localization', bool),
             'start_pose': _value('start_pose', str),
             'trajectory_file': _value('trajectory_file', str),
+            'final_trajectory_file': _value('final_trajectory_file', str),
             'use_sim_time': _value('use_sim_time', bool),
         },
     ]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -15,7 +14,7 @@ from typing import Any
 
 import yaml
 
-from bdgs_ros.bridge.runner import PARENT_VARIABLE, STACKS_SIGNAL
+from bdgs_ros.bridge.runner import END_SIGNAL, PARENT_VARIABLE, STACKS_SIGNAL
 
 _GRACE_S = 5.0
 _FORWARDED_WITH_VALUE = ('--log-level', '--log-config-file', '--log-file-name', '--enclave', '-e')
@@ -124,11 +123,18 @@ class Children:
     def _alive(self) -> list[subprocess.Popen[bytes]]:
         return [c.process for c in self.children.values() if c.process is not None]
 
+    def stop_one(self, name: str) -> None:
+        """End a child gently, if it runs, without waiting; its end is no news then."""
+        child = self.children.get(name)
+        if child is not None and child.process is not None:
+            child.done = True
+            child.process.send_signal(END_SIGNAL)
+
     def stop(self) -> None:
         """End all children, gently first."""
         alive = self._alive()
         for process in alive:
-            process.send_signal(signal.SIGTERM)
+            process.send_signal(END_SIGNAL)
         deadline = time.monotonic() + _GRACE_S
         for process in alive:
             _end(process, max(0.1, deadline - time.monotonic()))

@@ -8,6 +8,8 @@ import gc
 import os
 import signal
 import sys
+import threading
+import time
 from collections.abc import Callable
 
 import rclpy
@@ -23,7 +25,10 @@ from bdgs_ros.core.errors import BdgsError
 PARENT_VARIABLE = 'BDGS_PARENT_PID'
 STACKS_SIGNAL = signal.SIGUSR1
 """A node that gets it writes to its standard error where all its threads are."""
+END_SIGNAL = signal.SIGUSR2
+"""By which slam_node ends its children: there is nothing to be saved any more."""
 _PR_SET_PDEATHSIG = 1
+_PATIENCE_S = 15.0  # with a parent that does not say what is to be done
 _SPIN_S = 0.1
 REFUSED = 2
 """Exit status when parameters or inputs were refused."""
@@ -40,6 +45,7 @@ class GraphNode(Node):
         """How much its callbacks give way to other processes; workers have their own."""
         self.realtime_priority = 0
         """Of all threads of its process, see `priority.go_first`."""
+        self._ending = False
 
     def finish(self, exit_code: int = 0) -> None:
         """End the process from any thread, when the current callback is over."""
@@ -47,6 +53,38 @@ class GraphNode(Node):
         self.finished = True
         if self.executor is not None:
             self.executor.wake()
+
+    def results(self) -> list[Callable[[], str]]:
+        """Return what saves the node's results, each saying what it saved; none by default."""
+        return []
+
+    def interrupt(self) -> None:
+        """
+        Save the results and end the process, at the second time without.
+
+        Where slam_node, which started this process, lives, it is left to it to ask for them: who
+        stops a service sends all of its processes a signal at once.
+        """
+        if self._ending:
+            self.finish()
+        else:
+            self._ending = True
+            threading.Thread(target=self._save_and_finish, daemon=True).start()
+
+    def _save_and_finish(self) -> None:
+        deadline = time.monotonic() + _PATIENCE_S
+        while has_living_parent() and time.monotonic() < deadline:
+            time.sleep(_SPIN_S)
+        if not has_living_parent():
+            for save in self.results():
+                self._save(save)
+        self.finish()
+
+    def _save(self, save: Callable[[], str]) -> None:
+        try:
+            self.get_logger().info(f'saved at the end: {save()}')
+        except (BdgsError, OSError) as error:
+            self.get_logger().error(f'not saved: {error}')
 
     def close(self) -> None:
         """Stop threads and child processes."""
@@ -57,7 +95,7 @@ def run(
     args: list[str] | None = None,
 ) -> int:
     """
-    Run a node until it finishes or is interrupted.
+    Run a node until it finishes; a signal has it save its results first, a second one has not.
 
     Parameters
     ----------
@@ -69,7 +107,7 @@ def run(
     Returns
     -------
     exit_code : int
-        0 after SIGINT or SIGTERM too; 2 when the node refused its parameters or inputs.
+        0 after SIGINT, SIGTERM or SIGHUP too; 2 when the node refused its parameters or inputs.
 
     """
     follow_parent()
@@ -90,7 +128,9 @@ def run(
             node.get_logger().info(note)
         executor = make_executor()
         executor.add_node(node)
-        while not (node.finished or stop):
+        while not node.finished:
+            if stop:
+                node.finish() if stop.pop() == END_SIGNAL else node.interrupt()
             executor.spin_once(timeout_sec=_SPIN_S)
         return node.exit_code
     except BdgsError as error:
@@ -129,16 +169,20 @@ def _settle_garbage() -> None:
 
 def _catch_signals() -> list[int]:
     """
-    Return a list that SIGINT and SIGTERM are added to, instead of rclpy's own handlers.
+    Return a list that the signals to end are added to, instead of rclpy's own handlers.
 
-    Those shut the context down under the feet of callbacks and threads that still publish. A
-    second signal, when launch and the terminal both send one, changes nothing: nor may it wait
-    for a lock that the handler of the first one holds, as that of an Event would.
+    Those shut the context down under the feet of callbacks and threads that still publish. The
+    handler may not wait for a lock that the one of an earlier signal holds, as an Event would.
     """
     received: list[int] = []
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, END_SIGNAL):
         signal.signal(number, lambda number, _: received.append(number))
     return received
+
+
+def has_living_parent() -> bool:
+    """Return whether slam_node started this process and still runs."""
+    return os.environ.get(PARENT_VARIABLE) == str(os.getppid())
 
 
 def follow_parent() -> None:
@@ -147,5 +191,5 @@ def follow_parent() -> None:
     if not parent or not sys.platform.startswith('linux'):
         return
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-    if os.getppid() != int(parent):  # it died before the call above
+    if not has_living_parent():  # it died before the call above
         raise SystemExit(1)

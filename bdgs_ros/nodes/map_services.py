@@ -151,6 +151,13 @@ class MapServices:
         self._health.publish()
         return f"{count} Gaussians in '{file}'"
 
+    def results(self) -> list[Callable[[], str]]:
+        """Return what saves the final trajectory and the map, if files were named for them."""
+        node, saves = self._node, [('final_trajectory_file', self._on_save_trajectory)]
+        if not self._live.mapper.frozen:
+            saves.append(('map_file', self._on_save))
+        return [save for name, save in saves if node.get_parameter(name).value]
+
     def _on_load(self) -> str:
         """Replace the map, and have tracking look for the camera in it."""
         start_pose = self._start_pose()

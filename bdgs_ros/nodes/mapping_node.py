@@ -111,6 +111,10 @@ class MappingNode(GraphNode):
         self._map_services.start()
         self.get_logger().info(f'mapping is ready: mode {config.mode}')
 
+    def results(self) -> list[Callable[[], str]]:
+        """Return what saves the final trajectory and the map."""
+        return self._map_services.results()
+
     def _subscribe(self) -> None:
         self._source = FrameSource(
             self, self._config, self._health, self._keep_frame, self._forget

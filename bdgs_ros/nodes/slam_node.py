@@ -6,6 +6,8 @@ import json
 import sys
 import threading
 import time
+from collections.abc import Callable
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,7 @@ from bdgs_ros.bridge.processes import Child, Children, forwarded_arguments
 from bdgs_ros.bridge.runner import REFUSED, GraphNode, run
 from bdgs_ros.core.config import BdgsConfig, specs, with_values
 from bdgs_ros.core.errors import BdgsError, ConfigError
+from bdgs_ros.core.types import Trajectory
 from bdgs_ros.nodes.in_process import InProcessNodes
 
 _GRAPH = {
@@ -43,7 +46,6 @@ class SlamNode(GraphNode):
         self._slam_config = check_everything(self._config, self._values)
         self._files = self._result_files()
         self._started_s = time.time()
-        self._concluding = False
         self._observer = GraphObserver(self)
         self._savers = {
             name: self.create_client(Trigger, name) for name in self._results_to_save()
@@ -110,10 +112,29 @@ class SlamNode(GraphNode):
         child.done = True
         if status:
             self.get_logger().fatal(f'the replay ended with status {status}')
+            self._begin_to_end(status)
+        elif self._config.exit_at_end:
+            self._begin_to_end(0)
+
+    def interrupt(self) -> None:
+        """Have the results saved and end, at the second time without."""
+        if self._ending:
+            self.get_logger().warning('ending at once; what was not saved yet is lost')
+            self.finish()
+        else:
+            self._children.stop_one('replay_node')
+            self._begin_to_end(0)
+
+    def _begin_to_end(self, status: int) -> None:
+        """Have the results saved, if a folder was given, and end."""
+        if self._ending:
+            return
+        self._ending = True
+        if self._config.output:
+            threading.Thread(target=self._conclude, args=[status], daemon=True).start()
+        else:
+            self.get_logger().info("nothing is saved: the parameter 'output' names no folder")
             self.finish(status)
-        elif self._config.exit_at_end and not self._concluding:
-            self._concluding = True
-            threading.Thread(target=self._conclude, daemon=True).start()
 
     def _on_death(self, child: Child, status: int) -> None:
         """Start a node again, unless it has refused its parameters or dies all the time."""
@@ -138,16 +159,19 @@ class SlamNode(GraphNode):
         file = Path(str(values.get('map_file', '')))
         return file.is_file() and file.stat().st_mtime >= self._started_s
 
-    def _conclude(self) -> None:
+    def _conclude(self, status: int) -> None:
         """Write the results, in a thread: the answers of the services come to the executor."""
+        saves = [*(partial(self._call, name) for name in self._savers), self._write_metrics]
+        saved = [self._succeeds(save) for save in saves]
+        self.finish(status or int(not all(saved)))
+
+    def _succeeds(self, save: Callable[[], None]) -> bool:
         try:
-            for name in self._savers:
-                self._call(name)
-            self._write_metrics()
-            self.finish()
+            save()
         except (BdgsError, OSError) as error:
             self.get_logger().fatal(str(error))
-            self.finish(1)
+            return False
+        return True
 
     def _call(self, name: str) -> None:
         client = self._savers[name]
@@ -166,31 +190,39 @@ class SlamNode(GraphNode):
             raise BdgsError(f"'{name}': {future.result().message}")
 
     def _write_metrics(self) -> None:
-        from bdgs_ros.data.bag import open_bag
-        from bdgs_ros.data.bag_recording import BagRecording
-
         folder = Path(self._config.output).resolve()
-        report = json.loads(self._replay_report.read_text(encoding='utf-8'))
-        self._observer.diagnostics['replay'] = report
-        with open_bag(self._config.bag) as reader:
-            recording = BagRecording(reader)
-            metrics = self._observer.write_metrics(
-                folder,
-                self._slam_config,
-                recording.name,
-                recording.ground_truth,
-                Path(self._files['map_file']),
-                {
-                    'wall_s': time.time() - self._started_s,
-                    'mode': self._config.mode,
-                    'processes': self._config.processes,
-                    'respawns': sum(c.respawns for c in self._children.children.values()),
-                },
-            )
+        if self._replay_report.is_file():  # it is written at the end of the recording
+            report = json.loads(self._replay_report.read_text(encoding='utf-8'))
+            self._observer.diagnostics['replay'] = report
+        name, ground_truth = self._recording()
+        metrics = self._observer.write_metrics(
+            folder,
+            self._slam_config,
+            name,
+            ground_truth,
+            Path(self._files['map_file']),
+            {
+                'wall_s': time.time() - self._started_s,
+                'mode': self._config.mode,
+                'processes': self._config.processes,
+                'respawns': sum(c.respawns for c in self._children.children.values()),
+            },
+        )
         found = metrics['metrics']
         shown = ('frames_sent', 'frames_in', 'frames_lost', 'frames_missed', 'ate_rmse')
         text = ', '.join(f'{k} {found[k]["value"]:.6g}' for k in shown if k in found)
         self.get_logger().info(f"results in '{folder}': {text}")
+
+    def _recording(self) -> tuple[str, Trajectory | None]:
+        """Return the name of what was run, and its ground truth if it has one."""
+        if not self._config.bag:
+            return Path(self._config.output).resolve().name, None
+        from bdgs_ros.data.bag import open_bag
+        from bdgs_ros.data.bag_recording import BagRecording
+
+        with open_bag(self._config.bag) as reader:
+            recording = BagRecording(reader)
+            return recording.name, recording.ground_truth
 
     def close(self) -> None:
         """End the graph."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -227,6 +228,10 @@ class TrackingNode(GraphNode):
     def _on_pause(self, paused: bool) -> str:
         self._paused = paused
         return 'paused' if paused else 'going on'
+
+    def results(self) -> list[Callable[[], str]]:
+        """Return what saves the trajectory."""
+        return [self._on_save] if self.get_parameter('trajectory_file').value else []
 
     def _on_save(self) -> str:
         file = str(self.get_parameter('trajectory_file').value)

@@ -90,15 +90,79 @@ def check_same(live: Trajectory, offline: Trajectory) -> None:
     assert live.positions == pytest.approx(offline.positions, abs=1e-4)
 
 
-@pytest.mark.parametrize('with_signal', [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_everything(graph: Graph, with_signal: signal.Signals) -> None:
+def test_a_signal_ends_everything_and_says_that_nothing_is_saved(graph: Graph) -> None:
     slam = graph.node('slam_node')
     wait_ready(slam)
     pids = children(slam)
     assert len(pids) == 3
-    assert slam.stop(with_signal) == 0, slam.text()
+    assert slam.stop(signal.SIGTERM) == 0, slam.text()
     wait_gone(pids)
     assert 'Traceback' not in slam.text()
+    assert "nothing is saved: the parameter 'output' names no folder" in slam.text()
+
+
+RESULTS = ('trajectory.txt', 'trajectory_final.txt', 'map.ply', 'metrics.json')
+
+
+@pytest.mark.parametrize('how', ['ctrl-c', 'terminal closed', 'whole group', 'replay dies'])
+def test_every_way_out_saves(
+    graph: Graph, bag: Path, settings: dict[str, object], tmp_path: Path, how: str
+) -> None:
+    """In the middle of a recording; within seconds, and with what there is by then."""
+    output = tmp_path / 'results'
+    slam = graph.node('slam_node', bag=bag, output=output, rate=0.1, **settings)
+    wait_ready(slam)
+    time.sleep(5.0)
+    pids = children(slam)
+    names = {pid: Path(f'/proc/{pid}/cmdline').read_text() for pid in pids}
+    begun = time.monotonic()
+    if how == 'replay dies':
+        (replay,) = (pid for pid, name in names.items() if 'replay_node' in name)
+        os.kill(replay, signal.SIGKILL)
+        assert slam.wait(20.0) != 0
+    else:
+        number = signal.SIGHUP if how == 'terminal closed' else signal.SIGINT
+        for pid in pids if how == 'whole group' else ():  # as systemd does
+            os.kill(pid, number)
+        assert slam.stop(number, 20.0) == 0, slam.text()
+    assert time.monotonic() - begun < 10.0
+    wait_gone(pids)
+    assert 'Traceback' not in slam.text()
+    assert [name for name in RESULTS if not (output / name).is_file()] == []
+    online = read_trajectory(output / 'trajectory.txt')
+    assert len(online) >= 5
+    assert len(read_trajectory(output / 'trajectory_final.txt')) >= len(online) - 3
+    metrics = json.loads((output / 'metrics.json').read_text())['metrics']
+    assert metrics['frames_in']['value'] >= len(online)
+
+
+def test_a_second_signal_ends_at_once(
+    graph: Graph, bag: Path, settings: dict[str, object], tmp_path: Path
+) -> None:
+    slam = graph.node('slam_node', bag=bag, output=tmp_path / 'out', rate=0.1, **settings)
+    wait_ready(slam)
+    pids = children(slam)
+    slam.process.send_signal(signal.SIGINT)
+    time.sleep(0.3)
+    slam.process.send_signal(signal.SIGINT)
+    assert slam.wait(10.0) == 0
+    wait_gone(pids)
+    assert 'ending at once' in slam.text()
+
+
+def test_nodes_that_lose_their_parent_save_what_they_have(
+    graph: Graph, bag: Path, settings: dict[str, object], tmp_path: Path
+) -> None:
+    output = tmp_path / 'results'
+    slam = graph.node('slam_node', bag=bag, output=output, rate=0.1, **settings)
+    wait_ready(slam)
+    time.sleep(5.0)
+    pids = children(slam)
+    slam.process.kill()
+    wait_gone(pids)
+    missing = [name for name in RESULTS[:3] if not (output / name).is_file()]
+    assert missing == [], slam.text()
+    assert len(read_trajectory(output / 'trajectory.txt')) >= 5
 
 
 def test_children_die_with_their_parent_and_dead_ones_are_started_again(graph: Graph) -> None:
