@@ -378,9 +378,8 @@ def adam_steps(
         expect_shape('rows', rows, groups[0].params.shape[:1])
         rows = np.ascontiguousarray(rows, dtype=np.bool_)
     constants = AdamConstants(step or 0, betas, eps)
-    natives = [
-        v for v in VARIANTS if load_module(v) is not None and backend in (v, 'native', 'auto')
-    ]
+    able = [v for v in available_backends() if v in VARIANTS]  # found once, not every step
+    natives = [v for v in able if backend in (v, 'native', 'auto')]
     native = _backend(natives[0]) if natives else None
     if isinstance(native, NativeBackend):
         native.adam_steps(checked, rows, constants, threads)

@@ -72,19 +72,12 @@ class NativeBackend:
         """Render, compare and differentiate."""
         arrays = _empty_gradients(len(scene.gaussians))
         images = _empty_images(scene) if with_images else None
-        terms = (
-            weights.color * (1 - weights.ssim),
-            weights.color * weights.ssim,
-            weights.depth,
-            weights.smooth,
-            weights.empty,
-        )
         *terms_found, d_log_gain, d_offset, pose = self.workspace.fused_step(
             *_arguments(scene),
             target.color,
             target.depth,
             target.weight,
-            terms,
+            weights.factors(),
             target.exposure,
             arrays,
             images,

@@ -100,6 +100,16 @@ class LossWeights:
     smooth: float = 0.0
     empty: float = 0.0
 
+    def factors(self) -> tuple[float, float, float, float, float]:
+        """Return the factors of the terms as kernels take them: L1, 1 - SSIM, depth, ..."""
+        return (
+            self.color * (1 - self.ssim),
+            self.color * self.ssim,
+            self.depth,
+            self.smooth,
+            self.empty,
+        )
+
 
 @dataclass(frozen=True)
 class FusedResult:

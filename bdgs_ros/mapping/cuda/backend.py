@@ -71,7 +71,7 @@ class CudaBackend:
         self.device.rasterizer.compare(
             [color, 0, 0, depth, weight, 0],
             scene.camera.width,
-            term_weights(weights),
+            weights.factors(),
             [*map(address, gradients)],
             address(result),
         )
@@ -112,17 +112,6 @@ class CudaBackend:
         shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, 3), (count,))
         gradients = [self.device.zeros(*shape) for shape in shapes]
         return gradients, self.device.zeros(self.device.results, dtype=torch.float64)
-
-
-def term_weights(weights: LossWeights) -> tuple[float, float, float, float, float]:
-    """Return the factors of the terms as the kernels take them: L1, SSIM, depth, ..."""
-    return (
-        weights.color * (1 - weights.ssim),
-        weights.color * weights.ssim,
-        weights.depth,
-        weights.smooth,
-        weights.empty,
-    )
 
 
 def _to_numpy(tensor: Tensor) -> Array:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import weakref
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -56,8 +55,7 @@ class Images:
         if key not in self._scales:
             for old in [k for k in self._scales if k[0] == level.camera]:
                 del self._scales[old]
-            scale = np.broadcast_to(level.vignette.scale(level.camera), level.image.shape)
-            self._scales[key] = self._device.tensor(np.ascontiguousarray(scale[..., 0]))
+            self._scales[key] = self._device.tensor(level.vignette.scale(level.camera)[..., 0])
         return self._scales[key]
 
 

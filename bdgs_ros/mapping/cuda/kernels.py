@@ -21,6 +21,7 @@ from bdgs_ros.core.errors import MapError
 from bdgs_ros.core.types import Pose
 
 MODULE = 'bdgs_ros._rasterizer_cuda'
+POSE, EXPOSURE = slice(0, 16), slice(28, 30)  # of a view's state: `ViewState` in update.cuh
 
 _log = logging.getLogger(__name__)
 
@@ -167,6 +168,6 @@ def view_state(
 ) -> NDArray[np.float64]:
     """Return a view that has not been optimised yet, shape (size,)."""
     state = np.zeros(size)
-    state[:16] = np.asarray(T_camera_world).ravel()
-    state[28:30] = exposure
+    state[POSE] = np.asarray(T_camera_world).ravel()
+    state[EXPOSURE] = exposure
     return state

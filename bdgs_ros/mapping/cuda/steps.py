@@ -12,18 +12,17 @@ from torch import Tensor
 
 from bdgs_ros.core import se3
 from bdgs_ros.core.config import MappingConfig
-from bdgs_ros.mapping.cuda.backend import term_weights
 from bdgs_ros.mapping.cuda.images import Images
-from bdgs_ros.mapping.cuda.kernels import Device, address, view_state
+from bdgs_ros.mapping.cuda.kernels import EXPOSURE, POSE, Device, address, view_state
 from bdgs_ros.mapping.cuda.store import DeviceParameters, DeviceShading
 from bdgs_ros.mapping.densify import Pull, strongest
 from bdgs_ros.mapping.gaussians import GaussianMap
 from bdgs_ros.mapping.keyframes import MapKeyframe, Window
-from bdgs_ros.mapping.parameters import HostParameters
+from bdgs_ros.mapping.parameters import RASTERISED, HostParameters
 from bdgs_ros.mapping.steps import learning_rates, least_logit, loss_weights, penalised_by
 
-_POSE, _FIRST, _SECOND = slice(0, 16), slice(16, 22), slice(22, 28)
-_EXPOSURE, _E_FIRST, _E_SECOND = slice(28, 30), slice(30, 32), slice(32, 34)
+_FIRST, _SECOND = slice(16, 22), slice(22, 28)  # of a view's state: moments of its pose
+_E_FIRST, _E_SECOND = slice(30, 32), slice(32, 34)  # and of its exposure
 _BETAS = (0.9, 0.999)
 
 
@@ -43,7 +42,7 @@ class CudaSteps:
     def __init__(self, config: MappingConfig, device: Device) -> None:
         self._config = config
         self._device = device
-        self._weights = term_weights(loss_weights(config))
+        self._weights = loss_weights(config).factors()
         self._rates = tuple(learning_rates(config).values())
         self._images = Images(device)
         self._mirror = _Mirror(device)
@@ -81,7 +80,7 @@ class CudaSteps:
         camera = level.camera if window is None else level.cut(window).camera
         state = self._states[self._row[id(keyframe)]]
         shading = self._shading(state)
-        values = list(parameters.tensors('values'))
+        values = list(parameters.rasterised().values())
         shown = list(values)
         if shading is not None:
             shown[4] = shading.colors(values[4], self._visible)
@@ -91,14 +90,15 @@ class CudaSteps:
         result = device.zeros(device.results, dtype=torch.float64)
         per_pixel = 1 / (camera.width * camera.height)
         target, stride = self._images.target(level, window)
+        first, second = zip(*(parameters.moments[name] for name in RASTERISED), strict=True)
         pull = self._pull
         device.rasterizer.step(
             target,
             stride,
             self._weights,
             [*map(address, values)],
-            [*map(address, parameters.tensors(0))],
-            [*map(address, parameters.tensors(1))],
+            [*map(address, first)],
+            [*map(address, second)],
             tuple(rate_scale * rate for rate in self._rates),
             (config.loss.dynamic * per_pixel, config.loss.reg * per_pixel),
             [
@@ -146,7 +146,7 @@ class CudaSteps:
     def _shading(self, state: Tensor) -> DeviceShading | None:
         if self._parameters.values['harmonics'].shape[1] == 0:
             return None
-        T = state[_POSE].view(4, 4)
+        T = state[POSE].view(4, 4)
         return DeviceShading(self._parameters, (-T[:3, :3].T @ T[:3, 3]).float())
 
     def _wanted(self, shading: DeviceShading | None) -> tuple[Tensor | None, Tensor | None]:
@@ -207,10 +207,10 @@ def _state(device: Device, keyframe: MapKeyframe) -> NDArray[np.float64]:
 
 
 def _bring_back(keyframe: MapKeyframe, state: NDArray[np.float64]) -> None:
-    T_camera_world = state[_POSE].reshape(4, 4)
+    T_camera_world = state[POSE].reshape(4, 4)
     if not np.array_equal(T_camera_world, keyframe.T_camera_world):
         keyframe.T_world_camera = se3.orthonormalise(se3.inverse(T_camera_world))
-    keyframe.exposure = state[_EXPOSURE].astype(np.float32)
+    keyframe.exposure = state[EXPOSURE].astype(np.float32)
     keyframe.pose_moments = [state[_FIRST].astype(np.float32), state[_SECOND].astype(np.float32)]
     keyframe.exposure_moments = [
         state[_E_FIRST].astype(np.float32),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -109,12 +109,6 @@ class DeviceParameters:
         """Replace an array and its moments."""
         self[name] = array
         self.moments[name] = [torch.zeros_like(self.values[name]) for _ in range(2)]
-
-    def tensors(self, which: str | int) -> Iterable[Tensor]:
-        """Return what is rasterised, in order: 'values', or its moments 0 or 1."""
-        if which == 'values':
-            return [self.values[name] for name in RASTERISED]
-        return [self.moments[name][int(which)] for name in RASTERISED]
 
 
 class DeviceShading:
