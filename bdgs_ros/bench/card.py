@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from bdgs_ros.bench import mapping, sequences
 from bdgs_ros.bench.harness import Cell, Options
+from bdgs_ros.core.config.parameter_file import read_yaml
 from bdgs_ros.mapping import rasterize
 
 NAME = 'card'
@@ -40,7 +41,7 @@ def cells(options: Options) -> list[Cell]:
     """List a real and a synthetic recording, on the CPU and, if there is one, on the card."""
     ways = {'native': {'mapping.backend': 'native'}}
     if 'cuda' in rasterize.available_backends():
-        ways |= {'cuda': {'mapping.backend': 'cuda'}, 'card': dict(flattened(preset()))}
+        ways |= {'cuda': {'mapping.backend': 'cuda'}, 'card': read_yaml(PRESET)}
     refine = {'refine_s': options.refine_s}
     recordings = {sequences.REAL[0].name: sequences.real_settings(options)}
     name = sequences.synth_name(_SCENARIO)
@@ -71,24 +72,6 @@ def of_device(backend: str) -> dict[str, Any]:
 
     taken = torch.cuda.max_memory_allocated() + device.rasterizer.bytes
     return {'device': torch.cuda.get_device_name(), 'device_mb': taken / 1e6}
-
-
-def preset() -> Mapping[str, Any]:
-    """Return the parameters of config/card.yaml, nested."""
-    import yaml
-
-    document = yaml.safe_load(PRESET.read_text(encoding='utf-8'))
-    found: Mapping[str, Any] = document['/**']['ros__parameters']
-    return found
-
-
-def flattened(nested: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:
-    """Yield parameters by their full names."""
-    for name, value in nested.items():
-        if isinstance(value, Mapping):
-            yield from flattened(value, f'{prefix}{name}.')
-        else:
-            yield f'{prefix}{name}', value
 
 
 def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from bdgs_ros.bridge.node_config import NODE_CONFIGS
 from bdgs_ros.core.config import BdgsConfig, ParamSpec, specs, validate, with_values
+from bdgs_ros.core.config.parameter_file import read_yaml
 from bdgs_ros.core.errors import ConfigError
 from bdgs_ros.eval.metric import dump_json
 
@@ -111,57 +112,6 @@ def parse_overrides(texts: list[str]) -> dict[str, str]:
         if not equals:
             raise ConfigError(f"--set expects NAME=VALUE, received '{text}'")
         values[name.strip()] = value.strip()
-    return values
-
-
-def read_yaml(path: Path) -> dict[str, Any]:
-    """
-    Read a ROS 2 parameter file, or plain nested names, as dotted name to value.
-
-    Sections of several nodes are joined. ROS's own names (`use_sim_time`, `qos_overrides`) are
-    passed over; other names are left for `with_values` to judge.
-
-    Raises
-    ------
-    ConfigError
-        If the file is missing or is not a mapping in yaml.
-
-    """
-    import yaml
-
-    try:
-        document = yaml.safe_load(path.read_text(encoding='utf-8'))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        problem = ' '.join(str(error).split())
-        raise ConfigError(f"cannot read parameters from '{path}': {problem}") from error
-    if document is None:
-        return {}
-    if not isinstance(document, Mapping):
-        raise ConfigError(f"'{path}' is not a parameter file: expected names and values")
-    values: dict[str, Any] = {}
-    for section in _sections(document):
-        values.update(_flatten(section))
-    return values
-
-
-def _sections(document: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
-    nodes = [v for v in document.values() if isinstance(v, Mapping) and 'ros__parameters' in v]
-    if not nodes:
-        yield document
-    for node in nodes:
-        yield node['ros__parameters'] or {}
-
-
-def _flatten(section: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
-    values: dict[str, Any] = {}
-    for key, value in section.items():
-        name = f'{prefix}{key}'
-        if name in ('use_sim_time', 'qos_overrides'):
-            continue
-        if isinstance(value, Mapping):
-            values.update(_flatten(value, f'{name}.'))
-        else:
-            values[name] = value
     return values
 
 
