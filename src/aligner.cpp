@@ -82,7 +82,7 @@ struct Params {
 
 // What is worth comparing in a reference level, in rows of the image.
 struct Points {
-  Plane x, y, z, grey, gx, gy, p_static;
+  Plane x, y, z, grey, gx, gy, dx, dy, p_static;
   int size() const { return static_cast<int>(x.size()); }
 };
 
@@ -391,12 +391,13 @@ constexpr float kLeastStatic = 0.02f;  // what surely moves is not worth its tim
 void collect_points(Level& level, const Sweep& s) {
   const Images& images = *level.images;
   Points& points = level.points;
-  const std::array<Plane*, 7> planes = {&points.x,  &points.y,  &points.z,       &points.grey,
-                                        &points.gx, &points.gy, &points.p_static};
+  const std::array<Plane*, 9> planes = {&points.x,  &points.y,  &points.z,
+                                        &points.grey, &points.gx, &points.gy,
+                                        &points.dx, &points.dy, &points.p_static};
   for (Plane* plane : planes) plane->resize(static_cast<size_t>(level.width) * level.height);
   float *x = points.x.data(), *y = points.y.data(), *z = points.z.data();
   float *grey = points.grey.data(), *gx = points.gx.data(), *gy = points.gy.data();
-  float* p_static = points.p_static.data();
+  float *dx = points.dx.data(), *dy = points.dy.data(), *p_static = points.p_static.data();
   size_t count = 0;
   for (int v = 1; v + 1 < level.height; ++v) {
     const float r = row_share(static_cast<float>(v), static_cast<float>(level.height));
@@ -411,6 +412,8 @@ void collect_points(Level& level, const Sweep& s) {
       grey[count] = images.grey[i];
       gx[count] = images.gx[i];
       gy[count] = images.gy[i];
+      dx[count] = images.dx[i];
+      dy[count] = images.dy[i];
       p_static[count] = level.p_static[i];
       count += inverse > 0 && level.p_static[i] >= kLeastStatic;
     }
@@ -438,16 +441,28 @@ struct Scales {
   float inverse_depth = 0.1f;  // and in 1 / m
 };
 
+// Which gradients the Jacobians are made of: shares of the current image's and the reference's, and
+// whether depth has the part that needs none.
+struct Mixture {
+  float grey, grey_reference, depth, depth_reference, along_z;
+};
+constexpr Mixture kFit{0.5f, 0.5f, 1.0f, 0.0f, 1.0f};    // efficient second order
+constexpr Mixture kMean{0.5f, 0.5f, 0.5f, 0.5f, 1.0f};   // what both images show and what they
+constexpr Mixture kHalf{0.5f, -0.5f, 0.5f, -0.5f, 0.0f};  // do not agree on
+
 struct State {
   float R[9], t[3], gain, bias, pattern[kPattern];
   Scales scales;
   Sweep sweep;  // of the current image
+  Mixture mixture = kFit;
+  float least_static = 0;  // what is masked weighs so much at least
 };
 
 struct Totals {
   double H[kUnknowns][kUnknowns] = {};
   double g[kUnknowns] = {};
   double cost = 0, weight = 0;
+  double texture = 0;  // squared gradients of grey, as the motion sees them
   int in_view = 0, reference = 0, compared = 0, inliers = 0;
 };
 
@@ -457,6 +472,8 @@ struct alignas(64) Block {
   float weight[kBlock], cost[kBlock];
   float abs_I[kBlock], abs_D[kBlock];  // |residual| of comparable pixels, -1 elsewhere
   float in_view[kBlock], reference[kBlock], compared[kBlock], inlier[kBlock];
+  float seen[kBlock], same[kBlock], depth[kBlock];
+  int at[kBlock];  // pixel of the current image
 };
 
 BDGS_INLINE float mix(float a, float b, float c, float d, float fu, float fv) {
@@ -472,6 +489,8 @@ BDGS_INLINE void fill_block_body(const Points* points, int begin, int n, const L
   const float* __restrict pgrey = points->grey.data() + begin;
   const float* __restrict pgx = points->gx.data() + begin;
   const float* __restrict pgy = points->gy.data() + begin;
+  const float* __restrict pdx = points->dx.data() + begin;
+  const float* __restrict pdy = points->dy.data() + begin;
   const float* __restrict pstatic = points->p_static.data() + begin;
   const Images* images = level->images.get();
   const float* __restrict grey = images->grey.data();
@@ -484,6 +503,7 @@ BDGS_INLINE void fill_block_body(const Points* points, int begin, int n, const L
   const float* __restrict cstatic = level->p_static.data();
   Block& out = *block;
   const State s = *state;
+  const Mixture mix_g = s.mixture;
   const int width = level->width;
   const float fx = level->fx, fy = level->fy, cx = level->cx, cy = level->cy;
   const float max_u = level->width - 2.0f, max_v = level->height - 2.0f;
@@ -536,6 +556,10 @@ BDGS_INLINE void fill_block_body(const Points* points, int begin, int n, const L
     // gradients: grey as the mean of both images (efficient second order), inverse depth smooth
     const float gu = 0.5f * (gx[near] + pgx[i]), gv = 0.5f * (gy[near] + pgy[i]);
     const float du = dx[near], dv = dy[near];
+    const float mgu = mix_g.grey * gx[near] + mix_g.grey_reference * pgx[i];
+    const float mgv = mix_g.grey * gy[near] + mix_g.grey_reference * pgy[i];
+    const float mdu = mix_g.depth * du + mix_g.depth_reference * pdx[i];
+    const float mdv = mix_g.depth * dv + mix_g.depth_reference * pdy[i];
 
     // weights: t-distribution of both residuals together, times P(static)
     const float iI = 1.0f / __builtin_sqrtf(var_I + var_px * (gu * gu + gv * gv));
@@ -545,11 +569,11 @@ BDGS_INLINE void fill_block_body(const Points* points, int begin, int n, const L
     const float gap = raw[near] - iz, limit = 0.03f * iz + 4.0f * s.scales.inverse_depth;
     const float same = (raw[near] > 0 && abs_f(gap) > limit) ? 0.0f : 1.0f;  // surface
     const float w = same * (dof + 1.0f + has_depth) / (dof + m2);
-    const float ps = seen * pstatic[i] * cstatic[near];
+    const float ps = seen * max_f(pstatic[i] * cstatic[near], s.least_static);
     const float root = __builtin_sqrtf(ps * w);
     const float hI = root * iI, hD = root * iD * has_depth * sqrt_depth_weight;
 
-    const float ax = gu * fx * iz, ay = gv * fy * iz, az = -(ax * tx + ay * ty);
+    const float ax = mgu * fx * iz, ay = mgv * fy * iz, az = -(ax * tx + ay * ty);
     out.JI[0][i] = hI * ax;
     out.JI[1][i] = hI * ay;
     out.JI[2][i] = hI * az;
@@ -559,7 +583,8 @@ BDGS_INLINE void fill_block_body(const Points* points, int begin, int n, const L
     out.JI[6][i] = -hI * pgrey[i];
     out.JI[7][i] = -hI;
     out.JI[kColor][i] = hI * eI;
-    const float bx = du * fx * iz, by = dv * fy * iz, bz = -(bx * tx + by * ty) + iz * iz;
+    const float bx = mdu * fx * iz, by = mdv * fy * iz;
+    const float bz = -(bx * tx + by * ty) + mix_g.along_z * iz * iz;
     out.JD[0][i] = hD * bx;
     out.JD[1][i] = hD * by;
     out.JD[2][i] = hD * bz;
@@ -582,6 +607,10 @@ BDGS_INLINE void fill_block_body(const Points* points, int begin, int n, const L
     out.inlier[i] = (aI < inlier_I && aD < inlier_D) ? compared * same : 0.0f;
     out.reference[i] = reference;
     out.in_view[i] = reference * seen;
+    out.seen[i] = seen;
+    out.same[i] = same;
+    out.depth[i] = z;
+    out.at[i] = near;
   }
 }
 BDGS_VERSIONS(fill_block,
@@ -635,6 +664,7 @@ BDGS_INLINE void add_block_body(const Block* block, int n, Totals* totals) {
     for (int j = i; j < kDepth; ++j) totals->H[row][j < 6 ? j : j + 2] += depth[i][j];
     totals->g[row] += depth[i][kDepth];
   }
+  totals->texture += color[0][0] + color[1][1];
   totals->cost += total(block->cost, n);
   totals->weight += total(block->weight, n);
   totals->in_view += static_cast<int>(total(block->in_view, n) + 0.5f);
@@ -683,6 +713,7 @@ void scale_to(int all, int compared, Totals& totals) {
   }
   totals.cost *= scale;
   totals.weight *= scale;
+  totals.texture *= scale;
   for (int* count : {&totals.in_view, &totals.reference, &totals.compared, &totals.inliers})
     *count = static_cast<int>(*count * scale + 0.5);
 }
@@ -852,10 +883,20 @@ State state_of(const Matrix4& T, const Appearance& appearance, const Scales& sca
   return s;
 }
 
+constexpr int kFewer = 5000;    // points are enough to tell how much the images agree,
+constexpr int kEnough = 20000;  // if not much less of the image is to be compared
+constexpr double kDoubt = 1.1;  // noise of two images agrees by chance, a little
+
+struct Agreement {
+  double H[kUnknowns][kUnknowns] = {};
+  double texture = 0;  // 1: gradients of grey are the same, 0: they have nothing in common
+};
+
 struct Solution {
   Matrix4 T{};
   Appearance appearance{1, 0, 0, 0, 0};
   Totals totals;
+  Agreement agreement;
   float median_I = 0, median_D = 0;
   int iterations = 0;
   bool converged = false;
@@ -869,6 +910,23 @@ Scales scales_of(Samples& samples, const Params& params) {
   scales.inverse_depth = std::max(static_cast<float>(params.depth_noise),
                                   sigma_per_median * Samples::median(samples.D));
   return scales;
+}
+
+// What both images say of the motion: gradients that only one of them has, as noise has, cancel.
+Agreement agreement_of(const Points& points, const Level& level, State state, Params params,
+                       int compared) {
+  if (compared > kEnough) params.max_points = std::min(params.max_points, kFewer);
+  Samples unused;
+  state.mixture = kMean;
+  const Totals mean = accumulate(points, level, state, params, unused);
+  state.mixture = kHalf;
+  const Totals half = accumulate(points, level, state, params, unused);
+  Agreement out;
+  for (int i = 0; i < kUnknowns; ++i)
+    for (int j = 0; j < kUnknowns; ++j)
+      out.H[i][j] = mean.H[i][j] - (i < 6 && j < 6 ? kDoubt * half.H[i][j] : 0.0);
+  out.texture = (mean.texture - half.texture) / std::max(mean.texture + half.texture, 1e-12);
+  return out;
 }
 
 constexpr double kOverRelaxation = 1.3;  // reweighting and gradient noise make steps too short
@@ -941,12 +999,55 @@ Solution run_alignment(Pyramid& reference, Pyramid& current,
     }
   }
   Samples samples;
-  out.totals = accumulate(points_of(reference, pairs.back().first),
-                          current.levels[pairs.back().second],
-                          state_of(out.T, out.appearance, scales, current.sweep), params, samples);
+  const Points& points = points_of(reference, pairs.back().first);
+  const Level& finest = current.levels[pairs.back().second];
+  const State state = state_of(out.T, out.appearance, scales, current.sweep);
+  out.totals = accumulate(points, finest, state, params, samples);
+  out.agreement = agreement_of(points, finest, state, params, out.totals.compared);
   out.median_I = Samples::median(samples.I);
   out.median_D = Samples::median(samples.D);
   return out;
+}
+
+// ---------------------------------------------------------------------------- cells
+
+// What the points that one square of the current image shows say of the motion, on their own.
+struct Cell {
+  double H[6][6] = {}, g[6] = {};
+  double cost = 0, weight = 0, depth = 0;
+  int seen = 0, gaps = 0;  // gaps: another surface is seen
+};
+
+std::vector<Cell> accumulate_cells(const Points& points, const Level& level, const State& state,
+                                   const Params& params, int size) {
+  const int columns = (level.width + size - 1) / size, rows = (level.height + size - 1) / size;
+  std::vector<Cell> cells(static_cast<size_t>(columns) * rows);
+  Block block;
+  for (int begin = 0; begin < points.size(); begin += kBlock) {
+    const int n = std::min(kBlock, points.size() - begin);
+    fill_block(&points, begin, n, &level, &state, &params, &block);
+    for (int i = 0; i < n; ++i) {
+      if (block.seen[i] <= 0) continue;
+      const int u = block.at[i] % level.width, v = block.at[i] / level.width;
+      Cell& cell = cells[static_cast<size_t>(v / size) * columns + u / size];
+      for (int a = 0; a < 6; ++a) {
+        const double color = block.JI[a][i], depth = block.JD[a][i];
+        for (int b = a; b < 6; ++b) cell.H[a][b] += color * block.JI[b][i] + depth * block.JD[b][i];
+        cell.g[a] += color * block.JI[kColor][i] + depth * block.JD[kDepth][i];
+      }
+      cell.cost += block.cost[i];
+      cell.weight += block.weight[i];
+      cell.depth += block.depth[i];
+      cell.seen += 1;
+      cell.gaps += block.same[i] <= 0;
+    }
+  }
+  for (Cell& cell : cells) {
+    cell.depth /= std::max(cell.seen, 1);
+    for (int a = 0; a < 6; ++a)
+      for (int b = 0; b < a; ++b) cell.H[a][b] = cell.H[b][a];
+  }
+  return cells;
 }
 
 // ---------------------------------------------------------------------------- residual maps
@@ -1183,12 +1284,54 @@ py::dict align(Pyramid& reference, Pyramid& current,
     solution = run_alignment(reference, current, pairs, start, prior, params);
   }
   py::dict out = totals_dict(solution.totals, solution.median_I, solution.median_D);
+  out["agreed"] = py::array_t<double>({kUnknowns, kUnknowns}, &solution.agreement.H[0][0]);
+  out["texture"] = solution.agreement.texture;
   out["T"] = py::array_t<double>({4, 4}, solution.T.data());
   out["gain"] = solution.appearance[0];
   out["bias"] = solution.appearance[1];
   out["pattern"] = py::array_t<double>(kPattern, solution.appearance.data() + 2);
   out["iterations"] = solution.iterations;
   out["converged"] = solution.converged;
+  return out;
+}
+
+py::dict cells(Pyramid& reference, Pyramid& current, int reference_level, int current_level,
+               const Array& T, double gain, double bias, int size, const Params& params) {
+  Params equal = params;  // depth weighs as its noise says
+  equal.depth_weight = 1.0;
+  const Scales scales{static_cast<float>(params.intensity_noise),
+                      static_cast<float>(params.depth_noise)};
+  State state = state_of(matrix_of(T, "T_current_reference"), appearance_of(gain, bias, {0, 0, 0}),
+                         scales, current.sweep);
+  state.least_static = 1.0f;
+  const Level& level = current.levels.at(current_level);
+  std::vector<Cell> found;
+  {
+    py::gil_scoped_release release;
+    found = accumulate_cells(points_of(reference, reference_level), level, state, equal, size);
+  }
+  const int n = static_cast<int>(found.size());
+  const int columns = (level.width + size - 1) / size;
+  py::array_t<double> H({n, 6, 6}), g({n, 6}), cost(n), weight(n), depth(n), seen(n), gaps(n);
+  for (int k = 0; k < n; ++k) {
+    const Cell& cell = found[k];
+    std::copy_n(&cell.H[0][0], 36, H.mutable_data(k));
+    std::copy_n(cell.g, 6, g.mutable_data(k));
+    cost.mutable_at(k) = cell.cost;
+    weight.mutable_at(k) = cell.weight;
+    depth.mutable_at(k) = cell.depth;
+    seen.mutable_at(k) = cell.seen;
+    gaps.mutable_at(k) = cell.gaps;
+  }
+  py::dict out;
+  out["information"] = H;
+  out["gradient"] = g;
+  out["cost"] = cost;
+  out["weight"] = weight;
+  out["depth_m"] = depth;
+  out["seen"] = seen;
+  out["gaps"] = gaps;
+  out["columns"] = columns;
   return out;
 }
 
@@ -1258,5 +1401,6 @@ PYBIND11_MODULE(_aligner, m) {
   m.def("with_dynamic", &with_dynamic);
   m.def("normal_equations", &normal_equations);
   m.def("align", &align);
+  m.def("cells", &cells);
   m.def("residual_maps", &residual_maps);
 }

@@ -34,9 +34,9 @@ the frames before the fault to the truth. false_lost: frames without a pose befo
 to_lost_s: from its first frame to the first without a pose; empty if it was found again at once.
 wrong_ok: frames after the beginning of the fault with a pose more than 10 cm off. to_found_s: from
 the first frame with a view to the first good pose (within 10 cm); never_found: 1 if there is none.
-relative_ratio, the inliers over those of the last frames, is the sharpest part of the test: least,
-0.2 %, 1 % and median of the good frames, and median, 99 % and largest of those that show no known
-view or were aligned more than 10 cm off.
+sigma_share, the standard deviation of the position that the images leave over the depth of the
+view, is the test: largest, 99.8 %, 99 % and median of the good frames; median, 1 % and least of
+those that show no known view or were aligned more than 10 cm off.
 """
 
 FAULTS = ('jump', 'black', 'grey', 'blind', 'wall', 'none')
@@ -203,14 +203,14 @@ def _distribution(
     watch: Watch, good: NDArray[np.bool_], bad: NDArray[np.bool_]
 ) -> dict[str, list[float]]:
     known = np.array([e is not None for e in watch.evidence])
-    ratio = np.array([np.nan if e is None else e.relative_ratio for e in watch.evidence])
+    sigma = np.array([np.nan if e is None else e.sigma_share for e in watch.evidence])
     row = {}
     for name, chosen, shares in (
-        ('good_relative_ratio', good & known, (0.0, 0.002, 0.01, 0.5)),
-        ('bad_relative_ratio', bad & known, (0.5, 0.99, 1.0)),
+        ('good_sigma_share', good & known, (1.0, 0.998, 0.99, 0.5)),
+        ('bad_sigma_share', bad & known, (0.5, 0.01, 0.0)),
     ):
         if chosen.any():
-            row[name] = [round(float(q), 2) for q in np.quantile(ratio[chosen], shares)]
+            row[name] = [round(float(q), 3) for q in np.quantile(sigma[chosen], shares)]
     return row
 
 

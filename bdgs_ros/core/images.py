@@ -15,6 +15,18 @@ Mask = NDArray[np.bool_]
 _SAME_SURFACE = 0.03  # of the depth
 
 
+def metres(counts: NDArray[np.uint16], per_metre: float) -> DepthImage:
+    """
+    Return the depth that 16-bit counts stand for; 0, and the largest count, are no depth.
+
+    Some drivers write the largest value of the type where they saw nothing (librealsense
+    issue 3508): as a depth it would be a wall 65 m away.
+    """
+    depth_m = counts.astype(np.float32) / np.float32(per_metre)
+    depth_m[counts == np.iinfo(np.uint16).max] = 0
+    return depth_m
+
+
 def without_specks(mask: Mask, share: float) -> Mask:
     """Drop connected components smaller than `share` of the image, mask of shape (H, W)."""
     if np.count_nonzero(mask) < share * mask.size:

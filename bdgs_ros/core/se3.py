@@ -124,6 +124,15 @@ def to_position_quat_xyzw(T_a_b: Matrix) -> tuple[Vector, Vector]:
     return T_a_b[:3, 3].copy(), np.asarray(quat)
 
 
+def adjoint(T_a_b: Matrix) -> Matrix:
+    """Return the matrix, shape (6, 6), that takes tangents of b to a: `T exp(x) = exp(Ad x) T`."""
+    rotation = T_a_b[:3, :3]
+    out = np.zeros((6, 6))
+    out[:3, :3] = out[3:, 3:] = rotation
+    out[:3, 3:] = hat(T_a_b[:3, 3]) @ rotation
+    return out
+
+
 def rotation_angle_rad(T_a_b: Matrix) -> float:
     """Return the angle of the rotation part, in [0, pi]."""
     return float(np.linalg.norm(_rotation_vector(T_a_b[:3, :3])))

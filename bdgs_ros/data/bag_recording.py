@@ -16,6 +16,7 @@ from bdgs_ros.core.types import ColorImage, DepthImage, StampedPose, Trajectory
 from bdgs_ros.data.associate import MAX_DIFFERENCE_S
 from bdgs_ros.data.bag import BagReader, MessageRef, open_bag
 from bdgs_ros.data.messages import (
+    MM_PER_M,
     camera_from_message,
     color_from_message,
     depth_from_message,
@@ -105,6 +106,8 @@ class BagRecording:
         The open bag; the recording keeps it open.
     camera : PinholeCamera, optional
         Use this camera instead of the one in the bag.
+    depth_scale : float
+        Units of 16-bit depth in a metre.
     layout : TopicLayout, optional
         The names of the topics; recognised by default.
 
@@ -119,9 +122,11 @@ class BagRecording:
         self,
         reader: BagReader,
         camera: PinholeCamera | None = None,
+        depth_scale: float | None = None,
         layout: TopicLayout | None = None,
     ) -> None:
         self.reader = reader
+        self._depth_scale = depth_scale or MM_PER_M
         self.name = (
             reader.path.resolve().stem if reader.path.suffix else reader.path.resolve().name
         )
@@ -187,7 +192,9 @@ class BagRecording:
     def _to_depth(self, data: bytes) -> DepthImage:
         topic = self.layout.depth
         image = depth_from_message(
-            self.reader.deserialize(data, self.reader.topics[topic].msgtype), topic
+            self.reader.deserialize(data, self.reader.topics[topic].msgtype),
+            topic,
+            self._depth_scale,
         )
         self._check_size(topic, image.shape)
         return image

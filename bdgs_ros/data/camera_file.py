@@ -27,8 +27,11 @@ class RecordedCamera:
     """A camera as recorded, and how its depth images count."""
 
     camera: PinholeCamera
-    depth_scale: float
-    """Depth image units in a metre: 5000 for TUM and BONN, 1000 for millimetres."""
+    depth_scale: float | None = None
+    """
+    Depth image units in a metre; by default what is usual for the layout: 5000 for TUM and BONN
+    folders, 1000 (millimetres) for bags.
+    """
 
 
 def read_camera_file(path: Path) -> RecordedCamera:
@@ -63,7 +66,8 @@ def _from_section(path: Path, section: Mapping[str, Any]) -> RecordedCamera:
         fx, fy, cx, cy = (float(section[key]) for key in ('fx', 'fy', 'cx', 'cy'))
         width, height = int(section['width']), int(section['height'])
         camera = PinholeCamera(width, height, fx, fy, cx, cy, (k1, k2, p1, p2, k3))
-        recorded = RecordedCamera(camera, float(section.get('depth_scale', 5000.0)))
+        scale = section.get('depth_scale')
+        recorded = RecordedCamera(camera, None if scale is None else float(scale))
     except (TypeError, ValueError) as error:
         raise DatasetError(f"'{path}': {error}; expected for example\n  {_EXAMPLE}") from error
     _check(path, recorded)
@@ -72,7 +76,8 @@ def _from_section(path: Path, section: Mapping[str, Any]) -> RecordedCamera:
 
 def _check(path: Path, recorded: RecordedCamera) -> None:
     camera = recorded.camera
-    positive = (camera.width, camera.height, camera.fx, camera.fy, recorded.depth_scale)
+    scale = 1.0 if recorded.depth_scale is None else recorded.depth_scale
+    positive = (camera.width, camera.height, camera.fx, camera.fy, scale)
     finite = (*positive, camera.cx, camera.cy, *camera.distortion)
     if min(positive) <= 0 or not np.isfinite(finite).all():
         raise DatasetError(

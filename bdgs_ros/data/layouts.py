@@ -53,9 +53,10 @@ def open_recording(
     if path.is_dir() and (path / 'color.txt').is_file() and (path / SENSORS_FILE).is_file():
         return open_openloris(path, camera)
     if is_bag(path):
-        return BagRecording(
-            open_bag(path, allow_truncated), None if camera is None else camera.camera
-        )
+        bag = open_bag(path, allow_truncated)
+        if camera is None:
+            return BagRecording(bag)
+        return BagRecording(bag, camera.camera, camera.depth_scale)
     raise DatasetError(_unknown_layout(path))
 
 

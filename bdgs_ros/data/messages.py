@@ -19,6 +19,7 @@ from rosbags.typesys.store import Typestore
 from bdgs_ros.core import se3
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.errors import DatasetError
+from bdgs_ros.core.images import metres
 from bdgs_ros.core.types import ColorImage, DepthImage, Pose
 from bdgs_ros.data.trajectory_io import NS_PER_S
 
@@ -34,7 +35,7 @@ _TO_RGB = {
     'mono8': cv2.COLOR_GRAY2RGB,
 }
 _DEPTH_TYPES = {'16UC1': 'u2', 'mono16': 'u2', '32FC1': 'f4'}
-_MM_PER_M = np.float32(1000)
+MM_PER_M = 1000.0
 
 
 @cache
@@ -69,11 +70,12 @@ def color_from_message(message: Any, topic: str) -> ColorImage:
     return np.asarray(converted, dtype=np.uint8)
 
 
-def depth_from_message(message: Any, topic: str) -> DepthImage:
+def depth_from_message(message: Any, topic: str, per_metre: float = MM_PER_M) -> DepthImage:
     """
     Decode a depth Image to metres: `16UC1` counts millimetres, `32FC1` metres, REP 118.
 
-    What is not finite or not positive becomes 0.
+    What is not finite or not positive becomes 0, and so does the largest count of `16UC1`.
+    Cameras that count otherwise need their `per_metre`: 10000 for 0.1 mm.
 
     Raises
     ------
@@ -87,7 +89,7 @@ def depth_from_message(message: Any, topic: str) -> DepthImage:
     order = '>' if message.is_bigendian else '<'
     image = _pixels(message, topic, np.dtype(order + kind), 1)
     if kind == 'u2':
-        return image.astype(np.float32) / _MM_PER_M
+        return metres(image, per_metre)
     depth_m = image.astype(np.float32)
     depth_m[~(np.isfinite(depth_m) & (depth_m > 0))] = 0
     return depth_m

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.errors import DatasetError
+from bdgs_ros.core.images import metres
 from bdgs_ros.core.types import ColorImage, DepthImage, Trajectory
 from bdgs_ros.data.camera_file import RecordedCamera
 from bdgs_ros.data.trajectory_io import parse_stamp_ns, read_trajectory
@@ -106,7 +107,7 @@ def read_depth_file(path: Path, depth_scale: float) -> DepthImage:
             f"'{path}': expected a 16-bit single-channel depth image, "
             f'received {image.dtype} {image.shape}'
         )
-    return image.astype(np.float32) / np.float32(depth_scale)
+    return metres(np.asarray(image, np.uint16), depth_scale)
 
 
 class FolderRecording:
@@ -138,7 +139,7 @@ class FolderRecording:
         self.camera = camera.camera
         self.ground_truth = ground_truth
         self._folder = folder
-        self._depth_scale = camera.depth_scale
+        self._depth_scale = camera.depth_scale or DEPTH_SCALE
         self._color = read_image_list(folder / color_list)
         self._depth = read_image_list(folder / depth_list)
         self.color_stamps_ns = _stamps(self._color)

@@ -9,7 +9,7 @@ written down in `align_numpy`, the readable twin of the compiled kernel that run
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from types import ModuleType
 from typing import Any
@@ -34,6 +34,8 @@ _log = logging.getLogger(__name__)
 _FINE_LEVELS = 2  # of a refinement
 _FEWEST_POINTS = 256  # per level
 _AT_REST = np.zeros(6)
+CELL = 4  # pixels
+_OPEN = 10.0  # m and rad, standard deviation of what the images do not tell
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,8 @@ class ImagePyramid:
     handle: Any
     camera: PinholeCamera
     widths: tuple[int, ...]
+    depth_m: float
+    """Median; 1 where there is none."""
 
 
 @dataclass(frozen=True)
@@ -58,10 +62,14 @@ class AlignResult:
     """Shape (6, 6): of xi = (rho, phi) in `exp(xi) @ T_current_reference`, m^2 and rad^2."""
     inlier_ratio: float
     """Share of the compared pixels whose colour and depth agree."""
+    texture: float
+    """Correlation of the gradients of grey: 1 the same, 0 nothing in common."""
     coverage: float
     """Compared static pixels over all pixels of the finest level."""
     overlap: float
     """Share of the static pixels of the reference with depth that the current image shows."""
+    depth_m: float
+    """Median depth of the reference."""
     median_intensity: float
     """Median absolute colour residual, grey level in [0, 1]."""
     median_depth_sigma: float
@@ -85,6 +93,25 @@ class ResidualMaps:
     """Grey level of the reference minus that of the image."""
     valid: NDArray[np.bool_]
     """Both have depth here."""
+
+
+@dataclass(frozen=True)
+class Cells:
+    """What C squares of an image say of the motion, row by row."""
+
+    information: NDArray[np.float64]
+    """Shape (C, 6, 6): of xi = (rho, phi) in `exp(xi) @ T_current_reference`."""
+    gradient: NDArray[np.float64]
+    """Shape (C, 6): of half the cost."""
+    cost: NDArray[np.float64]
+    """Shape (C,): squared residuals over their variance, weighted; so are the next."""
+    weight: NDArray[np.float64]
+    depth_m: NDArray[np.float64]
+    seen: NDArray[np.float64]
+    """Points."""
+    gaps: NDArray[np.float64]
+    """Of them those where the image shows another surface."""
+    columns: int
 
 
 class Aligner:
@@ -168,7 +195,7 @@ class Aligner:
             _AT_REST if sweep is None else sweep,
         )
         widths = tuple(handle.level(i).width for i in range(count))
-        return ImagePyramid(handle, camera, widths)
+        return ImagePyramid(handle, camera, widths, _median_depth(handle.level(count - 1)))
 
     def with_dynamic(
         self,
@@ -184,7 +211,7 @@ class Aligner:
         height, width = pyramid.camera.shape
         still = _AT_REST if sweep is None else sweep
         handle = self._backend.with_dynamic(pyramid.handle, p_dynamic, width, height, still)
-        return ImagePyramid(handle, pyramid.camera, pyramid.widths)
+        return replace(pyramid, handle=handle)
 
     def align(
         self,
@@ -193,6 +220,7 @@ class Aligner:
         T_current_reference_init: Pose,
         fine_only: bool = False,
         prior_information: NDArray[np.float64] | None = None,
+        T_current_reference_prior: Pose | None = None,
     ) -> AlignResult:
         """
         Find the pose of the reference in the current camera.
@@ -202,11 +230,13 @@ class Aligner:
         reference, current : ImagePyramid
             Of any sizes: levels are paired by width.
         T_current_reference_init : ndarray, shape (4, 4)
-            Start, and mean of the prior.
+            Start.
         fine_only : bool
             Skip the coarse levels: the start is good to a few pixels.
         prior_information : ndarray, shape (6, 6), optional
-            Inverse covariance of the start; decides where the images cannot.
+            Inverse covariance of the prior; decides where the images cannot.
+        T_current_reference_prior : ndarray, shape (4, 4), optional
+            Mean of the prior; by default the start.
 
         Returns
         -------
@@ -216,6 +246,9 @@ class Aligner:
         """
         pairs = _pair_levels(reference.widths, current.widths)
         start = np.ascontiguousarray(T_current_reference_init, dtype=np.float64)
+        prior = start
+        if T_current_reference_prior is not None:
+            prior = np.ascontiguousarray(T_current_reference_prior, dtype=np.float64)
         information = None
         if prior_information is not None:
             information = prior_information * self._config.correlated_pixels
@@ -224,7 +257,7 @@ class Aligner:
             current.handle,
             pairs[-_FINE_LEVELS:] if fine_only else pairs,
             start,
-            start if information is not None else None,
+            prior if information is not None else None,
             information,
             self._params,
         )
@@ -272,14 +305,50 @@ class Aligner:
         )
         return ResidualMaps(depth_sigma, color, valid.astype(bool))
 
+    def cells(
+        self,
+        reference: ImagePyramid,
+        current: ImagePyramid,
+        result: AlignResult,
+        width: int = 80,
+    ) -> Cells:
+        """
+        Ask every square of the current image what it says of the motion, on its own.
+
+        Parameters
+        ----------
+        reference, current : ImagePyramid
+            What was aligned; masks are ignored.
+        result : AlignResult
+            Where: motions are small ones from there.
+        width : int
+            Wanted width of the image that squares of `CELL` pixels are cut of.
+
+        """
+        target = _nearest(current.widths, width)
+        raw = self._backend.cells(
+            reference.handle,
+            current.handle,
+            _nearest(reference.widths, current.widths[target]),
+            target,
+            np.ascontiguousarray(result.T_current_reference, dtype=np.float64),
+            result.gain,
+            result.bias,
+            CELL,
+            self._params,
+        )
+        return Cells(**raw)
+
     def _result(self, raw: dict[str, Any], reference: ImagePyramid, level: int) -> AlignResult:
         finest = reference.handle.level(level)
         return AlignResult(
             T_current_reference=raw['T'],
             covariance=self._covariance(raw),
             inlier_ratio=raw['inliers'] / max(raw['compared'], 1),
+            texture=raw['texture'],
             coverage=raw['compared'] / (finest.width * finest.height),
             overlap=raw['in_view'] / max(raw['reference'], 1),
+            depth_m=reference.depth_m,
             median_intensity=raw['median_intensity'],
             median_depth_sigma=raw['median_inverse_depth'] / self._config.depth_noise,
             iterations=raw['iterations'],
@@ -290,13 +359,20 @@ class Aligner:
         )
 
     def _covariance(self, raw: dict[str, Any]) -> NDArray[np.float64]:
-        """Invert the normal matrix; scaled by the residuals and by pixels that err together."""
-        information = raw['information'].copy()
+        """Invert what both images say; scaled by the residuals and by pixels that err together."""
+        information = raw['agreed'].copy()
         information[8:, 8:] += np.eye(3) * self._params.pattern_information
-        information += np.diag(1e-9 + 1e-6 * np.diag(information))
+        information += np.diag(1e-9 + 1e-6 * np.abs(np.diag(information)))
+        motion, mixed, other = information[:6, :6], information[:6, 6:], information[6:, 6:]
         variance = max(raw['cost'] / max(raw['weight'], 1.0), 1e-3)
         scale = variance * self._config.correlated_pixels
-        return np.asarray(np.linalg.inv(information)[:6, :6] * scale)
+        return _inverse(motion - mixed @ np.linalg.solve(other, mixed.T), scale)
+
+
+def _inverse(information: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
+    """Return the covariance; what is left open is as wide as `_OPEN`."""
+    values, axes = np.linalg.eigh(information / scale)
+    return np.asarray((axes / np.maximum(values, _OPEN**-2)) @ axes.T)
 
 
 def _choose_backend(name: str) -> ModuleType:
@@ -372,6 +448,11 @@ def _levels(width: int, config: AlignConfig) -> tuple[int, int]:
     while finest >> count >= 0.7 * config.coarse_width:
         count += 1
     return block, count
+
+
+def _median_depth(level: Any) -> float:
+    known = level.inverse_depth[level.inverse_depth > 0]
+    return 1.0 / float(np.median(known)) if len(known) else 1.0
 
 
 def _pair_levels(reference: tuple[int, ...], current: tuple[int, ...]) -> list[tuple[int, int]]:

@@ -35,7 +35,7 @@ cameras", ICCV 2015 (that rows are read one after the other).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -48,6 +48,7 @@ __all__ = [
     'Params',
     'align',
     'build_pyramid',
+    'cells',
     'normal_equations',
     'residual_maps',
     'with_dynamic',
@@ -64,6 +65,9 @@ _BRIGHTNESS_TIE = 1e-3  # share of the pixels that say gain 1 and bias 0
 _SURFACE_SHARE, _SURFACE_SCALES = 0.03, 4.0  # inverse depth may differ by share and scales
 _RESERVED = 4  # iterations kept for every finer level
 _COARSE_STOP = 2.0  # coarser levels stop at larger steps
+_FEWER = 5000  # points are enough to tell how much the images agree,
+_ENOUGH = 20000  # if not much less of the image is to be compared
+_DOUBT = 1.1  # noise of two images agrees by chance, a little
 
 
 @dataclass
@@ -101,6 +105,8 @@ class Points:
     grey: Array
     gradient: Array
     """Shape (K, 2), grey level per pixel."""
+    depth_gradient: Array
+    """Shape (K, 2), inverse depth per pixel, 0 where it is not one surface."""
     p_static: Array
 
 
@@ -128,6 +134,7 @@ def collect_points(pyramid: Pyramid, index: int) -> Points:
         swept(seen, -row_share(v.astype(np.float64), level.height), pyramid.sweep),
         level.grey[v, u].astype(np.float64),
         np.stack([level.gx[v, u], level.gy[v, u]], axis=1).astype(np.float64),
+        np.stack([level.dx[v, u], level.dy[v, u]], axis=1).astype(np.float64),
         level.p_static[v, u].astype(np.float64),
     )
 
@@ -137,9 +144,7 @@ def spread(points: Points, params: Params) -> tuple[Points, float]:
     count = len(points.grey)
     step = max(1, count // params.max_points)
     kept = np.arange(count) // _BLOCK % step == 0
-    chosen = Points(
-        points.xyz[kept], points.grey[kept], points.gradient[kept], points.p_static[kept]
-    )
+    chosen = Points(*(getattr(points, f.name)[kept] for f in fields(points)))
     return chosen, count / max(1, int(kept.sum()))
 
 
@@ -228,13 +233,37 @@ class Linearised:
     p_static: Array
     grey_gradient: Array
     depth_gradient: Array
+    at: NDArray[np.intp]
+    """Shape (K, 2): column and row of the nearest pixel of the current image."""
     gap: Array
     """How much nearer the current image is, 1/m; 0 where it has no depth."""
     inverse_z: Array
 
 
+@dataclass(frozen=True)
+class Mixture:
+    """Which gradients Jacobians are made of: shares of the current image's and the reference's."""
+
+    grey: float
+    grey_reference: float
+    depth: float
+    depth_reference: float
+    along_z: float
+    """1, or 0 without the part of depth that needs no gradient."""
+
+
+FIT = Mixture(0.5, 0.5, 1.0, 0.0, 1.0)  # efficient second order
+MEAN = Mixture(0.5, 0.5, 0.5, 0.5, 1.0)  # what both images show, and
+HALF = Mixture(0.5, -0.5, 0.5, -0.5, 0.0)  # what they do not agree on
+
+
 def linearise(
-    points: Points, level: Level, T: Array, sweep: Array, appearance: Appearance
+    points: Points,
+    level: Level,
+    T: Array,
+    sweep: Array,
+    appearance: Appearance,
+    mixture: Mixture = FIT,
 ) -> Linearised:
     """Return residuals and their derivatives by motion, exposure and depth pattern."""
     w = warp(points, level, T, sweep)
@@ -250,12 +279,14 @@ def linearise(
     gradient_I = 0.5 * (current + points.gradient)
     gradient_D = np.stack([_nearest(level.dx, w), _nearest(level.dy, w)], axis=1)
     J_I = np.zeros((len(e_I), 11))
-    J_I[:, :6] = _jacobian(gradient_I, w.xyz, level)
+    mixed_I = mixture.grey * current + mixture.grey_reference * points.gradient
+    mixed_D = mixture.depth * gradient_D + mixture.depth_reference * points.depth_gradient
+    J_I[:, :6] = _jacobian(mixed_I, w.xyz, level)
     J_I[:, 6], J_I[:, 7] = -points.grey, -1.0
     J_D = np.zeros((len(e_I), 11))
-    J_D[:, :6] = _jacobian(gradient_D, w.xyz, level)
+    J_D[:, :6] = _jacobian(mixed_D, w.xyz, level)
     along_z = np.zeros_like(w.xyz)
-    along_z[:, 2] = inverse_z**2
+    along_z[:, 2] = mixture.along_z * inverse_z**2
     J_D[:, :3] += along_z
     J_D[:, 3:6] += np.cross(w.xyz, along_z)
     J_D[:, 8:] = change
@@ -271,6 +302,7 @@ def linearise(
         p_static,
         gradient_I,
         gradient_D,
+        np.stack([w.u + 0.5, w.v + 0.5], axis=1).astype(int),
         np.where(raw > 0, raw - inverse_z, 0.0),
         inverse_z,
     )
@@ -315,14 +347,19 @@ def _same_surface(rows: Linearised, scales: Scales) -> NDArray[np.bool_]:
     return np.abs(rows.gap) <= limit
 
 
+def _normalised(rows: Linearised, scales: Scales, params: Params) -> tuple[Array, Array, Array]:
+    """Return the variances of colour and depth, and both residuals squared over them."""
+    noise = params.pixel_noise**2
+    var_I = scales.intensity**2 + noise * (rows.grey_gradient**2).sum(axis=1)
+    var_D = scales.inverse_depth**2 + noise * (rows.depth_gradient**2).sum(axis=1)
+    return var_I, var_D, rows.grey**2 / var_I + rows.depth**2 / var_D
+
+
 def _totals(
     points: Points, share: float, rows: Linearised, scales: Scales, params: Params
 ) -> dict[str, Any]:
     """Sum the weighted normal equations and count pixels; each point stands for `share`."""
-    noise = params.pixel_noise**2
-    var_I = scales.intensity**2 + noise * (rows.grey_gradient**2).sum(axis=1)
-    var_D = scales.inverse_depth**2 + noise * (rows.depth_gradient**2).sum(axis=1)
-    squared = rows.grey**2 / var_I + rows.depth**2 / var_D
+    var_I, var_D, squared = _normalised(rows, scales, params)
     same = _same_surface(rows, scales)
     weight = rows.p_static * same * (params.dof + 1 + rows.has_depth) / (params.dof + squared)
     w_I, w_D = weight / var_I, weight * rows.has_depth * params.depth_weight / var_D
@@ -340,6 +377,7 @@ def _totals(
         'gradient': share * gradient,
         'cost': share * float((weight * squared).sum()),
         'weight': share * float((weight * (1 + rows.has_depth)).sum()),
+        'texture': share * float((w_I[:, None] * rows.J_I[:, :2] ** 2).sum()),
         'compared': int(share * compared.sum() + 0.5),
         'inliers': int(share * (compared & agree & same).sum() + 0.5),
         'reference': int(share * reference.sum() + 0.5),
@@ -368,6 +406,96 @@ def normal_equations(
     appearance = Appearance(np.array([gain, bias, *pattern]))
     rows = linearise(points, level, T, current.sweep, appearance)
     return _totals(points, share, rows, Scales(intensity_scale, inverse_depth_scale), params)
+
+
+def _agreement(
+    points: Points,
+    share: float,
+    level: Level,
+    T: Array,
+    sweep: Array,
+    appearance: Appearance,
+    scales: Scales,
+    params: Params,
+) -> dict[str, Any]:
+    """
+    Return what both images say of the motion: `agreed`, shape (11, 11), and `texture`.
+
+    With gradients a and b of the two, `a b' + b a'` is twice the product of their mean with
+    itself less that of half their difference. What only one of them has, as noise has, is in
+    neither sum: a plain wall tells nothing, however many of its pixels are noisy. `texture` is
+    the correlation of the gradients of grey: 1 where they are the same, 0 where the images have
+    nothing in common.
+    """
+    mean, half = (
+        _totals(
+            points,
+            share,
+            linearise(points, level, T, sweep, appearance, mixture),
+            scales,
+            params,
+        )
+        for mixture in (MEAN, HALF)
+    )
+    agreed = mean['information'].copy()
+    agreed[:6, :6] -= _DOUBT * half['information'][:6, :6]
+    both, one = mean['texture'], half['texture']
+    return {'agreed': agreed, 'texture': (both - one) / max(both + one, 1e-12)}
+
+
+def cells(
+    reference: Pyramid,
+    current: Pyramid,
+    reference_level: int,
+    current_level: int,
+    T: Array,
+    gain: float,
+    bias: float,
+    size: int,
+    params: Params,
+) -> dict[str, Any]:
+    """
+    Return what each square of the current image says of the motion, on its own.
+
+    All that is seen counts, also what is masked, and by the least noise.
+
+    Returns
+    -------
+    cells : dict
+        Of C squares of `size` pixels, row by row, `columns` of them in a row: `information`,
+        shape (C, 6, 6), `gradient`, shape (C, 6), and of shape (C,) `cost`, `weight`, `depth_m`
+        (mean), `seen` (points) and `gaps` (points where another surface is seen).
+
+    """
+    points, level = collect_points(reference, reference_level), current.level(current_level)
+    appearance = Appearance(np.array([gain, bias, 0.0, 0.0, 0.0]))
+    rows = linearise(points, level, T, current.sweep, appearance)
+    scales = Scales(params.intensity_noise, params.depth_noise)
+    var_I, var_D, squared = _normalised(rows, scales, params)
+    same = _same_surface(rows, scales)
+    weight = rows.seen * same * (params.dof + 1 + rows.has_depth) / (params.dof + squared)
+    J_I = rows.J_I[:, :6] * np.sqrt(weight / var_I)[:, None]
+    J_D = rows.J_D[:, :6] * np.sqrt(weight * rows.has_depth / var_D)[:, None]
+    e_I, e_D = rows.grey * np.sqrt(weight / var_I), rows.depth * np.sqrt(weight / var_D)
+    columns, lines = -(-level.width // size), -(-level.height // size)
+    index = rows.at[:, 1] // size * columns + rows.at[:, 0] // size
+
+    def summed(values: Array) -> Array:
+        out = np.zeros((lines * columns, *values.shape[1:]))
+        np.add.at(out, index[rows.seen], values[rows.seen])
+        return out
+
+    seen = summed(np.ones(len(index)))
+    return {
+        'information': summed(J_I[:, :, None] * J_I[:, None] + J_D[:, :, None] * J_D[:, None]),
+        'gradient': summed(J_I * e_I[:, None] + J_D * e_D[:, None]),
+        'cost': summed(weight * squared),
+        'weight': summed(weight * (1 + rows.has_depth)),
+        'depth_m': summed(1.0 / rows.inverse_z) / np.maximum(seen, 1),
+        'seen': seen,
+        'gaps': summed((~same).astype(float)),
+        'columns': columns,
+    }
 
 
 def _step(
@@ -437,9 +565,15 @@ def align(
             scales = _scales(rows, params)
             converged = _step_px(step, level) < stop
             budget, left, done = budget - 1, left - 1, done + 1
-    rows = linearise(points, level, T, current.sweep, appearance)
+    totals = _totals(
+        points, share, linearise(points, level, T, current.sweep, appearance), scales, params
+    )
+    if totals['compared'] > _ENOUGH:
+        fewer = replace(params, max_points=min(params.max_points, _FEWER))
+        points, share = spread(collect_points(reference, i), fewer)
     return {
-        **_totals(points, share, rows, scales, params),
+        **totals,
+        **_agreement(points, share, level, T, current.sweep, appearance, scales, params),
         'T': T,
         'gain': float(appearance.values[0]),
         'bias': float(appearance.values[1]),

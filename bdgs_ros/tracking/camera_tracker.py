@@ -28,11 +28,14 @@ from bdgs_ros.core.types import (
     TrackingResult,
     TrackingStatus,
 )
+from bdgs_ros.tracking import covariance
 from bdgs_ros.tracking.align import Aligner, ImagePyramid
+from bdgs_ros.tracking.broken import BrokenRows, without_rows
 from bdgs_ros.tracking.keyframe_choice import KeyframeChoice
 from bdgs_ros.tracking.loss import Evidence, LossTest
 from bdgs_ros.tracking.motion import MotionPredictor
 from bdgs_ros.tracking.movers import MoverMask
+from bdgs_ros.tracking.parts import Parts, find_world
 from bdgs_ros.tracking.places import Place, Places
 from bdgs_ros.tracking.starts import (
     Attempt,
@@ -48,6 +51,7 @@ _log = logging.getLogger(__name__)
 _START_SIGMA = (0.3, 0.3)  # m and rad: how well the start in a known map is known
 _PLACE_SIGMA = (0.05, 0.03)  # of a pose from features
 _SPEED = (1.0, 2.0)  # m/s and rad/s, from one frame to the next that shall confirm it
+_LEAST_MOVED = 0.02  # of the view; less does not move the camera
 _MOST_TRACKED = 32  # keyframes; mapping that is further behind corrects nothing
 
 
@@ -66,6 +70,7 @@ class CameraTracker:
         )
         self._motion = MotionPredictor(config.motion)
         self._movers = MoverMask(config.movers)
+        self._broken = BrokenRows()
         self._readout_s = config.readout_s  # of the camera: outlives a reset
         self.refused = 0
         """How often mapping said what cannot be."""
@@ -79,6 +84,7 @@ class CameraTracker:
         self._keyframe: Reference | None = None
         self._model: Reference | None = None
         self._tracked: dict[int, Pose] = {}  # keyframes whose view has not come yet
+        self._doubt: dict[int, NDArray[np.float64]] = {}  # covariance of keyframes in world
         self._move: Pose | None = None  # of all that is known, since the last frame
         self._is_lost = False
         self._hypothesis: Hypothesis | None = None
@@ -87,8 +93,9 @@ class CameraTracker:
         """Of the last frame, aligned where it was expected."""
         self._motion.reset()
         self._movers.reset()
+        self._broken.reset()
+        self._is_whole = True
         self._choice.begin(None)
-        self._loss.reset()
         self._places.clear()
 
     def start_from(self, view: ModelView, keyframes: Iterable[Keyframe] = ()) -> None:
@@ -219,13 +226,19 @@ class CameraTracker:
 
         """
         prior = self._prior(frame, labels)
+        missing = self._broken.share(frame.color)
+        self._is_whole = missing == 0
+        if missing:
+            _log.warning(
+                'image at stamp %d ns: %.0f %% are missing', frame.stamp_ns, 100 * missing
+            )
+            prior = without_rows(prior, missing)
         expected = np.maximum(prior, self._movers.expected(frame.camera.shape))
         sweep = self._readout_s * self._motion.velocity
         current = self._aligner.pyramid(frame.color, frame.depth_m, expected, frame.camera, sweep)
         if self._keyframe is None and not self._is_lost:
             return self._begin(frame, current, prior)
         self._choice.count()
-        self._loss.turn_rad_s = float(np.linalg.norm(self._motion.velocity[3:]))
         first: Attempt | None = None
         for start in self._starts(frame, prior, hurried):
             attempt = self._attempt(start, frame.stamp_ns, current, prior)
@@ -256,8 +269,8 @@ class CameraTracker:
         self, frame: RgbdFrame, current: ImagePyramid, p_dynamic: ProbabilityImage
     ) -> TrackingResult:
         """Make the first frame that shows anything the origin of the world and a keyframe."""
-        T_world_camera, covariance = se3.identity(), 1e-6 * np.eye(6)
-        if not self._loss.can_be_aligned_to(frame.depth_m, p_dynamic):
+        T_world_camera, spread = se3.identity(), 1e-6 * np.eye(6)
+        if not (self._is_whole and self._loss.can_be_aligned_to(frame.depth_m, p_dynamic)):
             nowhere = np.asarray(np.linalg.inv(information_of(_START_SIGMA)))
             return TrackingResult(
                 frame.stamp_ns,
@@ -269,13 +282,13 @@ class CameraTracker:
                 0.0,
                 0.0,
             )
-        self._motion.update(frame.stamp_ns, T_world_camera, covariance)
-        self._become_keyframe(frame, T_world_camera, current, p_dynamic)
+        self._motion.update(frame.stamp_ns, T_world_camera, spread)
+        self._become_keyframe(frame, T_world_camera, current, p_dynamic, spread)
         return TrackingResult(
             frame.stamp_ns,
             TrackingStatus.OK,
             T_world_camera,
-            covariance,
+            spread,
             True,
             p_dynamic,
             1.0,
@@ -323,11 +336,32 @@ class CameraTracker:
         self, start: Start, stamp_ns: int, current: ImagePyramid, prior: ProbabilityImage
     ) -> Attempt:
         """Align coarse to fine, see what moves, refine against the rendered static map."""
-        coarse = self._align(start.reference, current, start.T_world_camera, start.information)
-        p_dynamic = self._see_movers(prior, current, coarse)
+        first = self._align(start.reference, current, start.T_world_camera, start.information)
+        parts, coarse = self._find_world(start, current, first), first
+        if parts is not None and (parts.is_other or parts.moved.mean() > _LEAST_MOVED):
+            coarse, current = self._align_world(start, current, prior, first, parts)
+        p_dynamic = self._see_movers(prior, current, coarse, parts)
         current = self._aligner.with_dynamic(current, p_dynamic, self._sweep(stamp_ns, coarse))
         fine = self._refine(current, coarse, start.information)
-        return Attempt(start, current, coarse, fine, p_dynamic)
+        spread = self._relative_covariance(parts, first, coarse, fine)
+        return Attempt(start, current, coarse, fine, p_dynamic, spread)
+
+    def _relative_covariance(
+        self, parts: Parts | None, first: Estimate, coarse: Estimate, best: Estimate
+    ) -> NDArray[np.float64]:
+        """Return how far the pose may be off relative to the keyframe."""
+        if parts is None:
+            return best.quality.covariance
+        T_first = first.quality.T_current_reference
+        step = se3.log(coarse.quality.T_current_reference @ se3.inverse(T_first))
+        return covariance.of_alignment(
+            parts.cells,
+            parts.moved,
+            step,
+            best.quality.covariance,
+            self._motion.velocity,
+            self._config.covariance,
+        )
 
     def _sweep(self, stamp_ns: int, coarse: Estimate) -> NDArray[np.float64]:
         """Return the motion during the readout of a rolling shutter, with this frame's own."""
@@ -342,25 +376,63 @@ class CameraTracker:
         current: ImagePyramid,
         guess: Pose,
         information: NDArray[np.float64],
+        expected: Pose | None = None,
         fine_only: bool = False,
     ) -> Estimate:
+        """Align from a guess; `information` is of what was expected, by default the guess."""
         aligner = self._refiner if fine_only else self._aligner
-        T_current_reference = se3.inverse(guess) @ reference.T_world_camera
+        guess, expected = (
+            se3.inverse(pose) @ reference.T_world_camera
+            for pose in (guess, guess if expected is None else expected)
+        )
         quality = aligner.align(
-            reference.pyramid, current, T_current_reference, fine_only, information
+            reference.pyramid, current, guess, fine_only, information, expected
         )
         T_world_camera = reference.T_world_camera @ se3.inverse(quality.T_current_reference)
         return Estimate(se3.orthonormalise(T_world_camera), quality)
 
+    def _find_world(self, start: Start, current: ImagePyramid, coarse: Estimate) -> Parts | None:
+        """Ask which part of the view is the world, if parts of it move on their own."""
+        if not (self._config.masked and self._config.parts.enabled):
+            return None
+        reference, quality = start.reference, coarse.quality
+        cells = self._aligner.cells(reference.pyramid, current, quality)
+        T_expected = se3.inverse(start.T_world_camera) @ reference.T_world_camera
+        expected = se3.log(T_expected @ se3.inverse(quality.T_current_reference))
+        return find_world(cells, expected, start.information, self._config.parts)
+
+    def _align_world(
+        self,
+        start: Start,
+        current: ImagePyramid,
+        prior: ProbabilityImage,
+        coarse: Estimate,
+        parts: Parts,
+    ) -> tuple[Estimate, ImagePyramid]:
+        """Align once more, without what moves against the world."""
+        moved = parts.mask(prior.shape, self._config.movers.p_dynamic)
+        still = self._aligner.with_dynamic(current, np.maximum(prior, moved))
+        T_current_reference = se3.exp(parts.step) @ coarse.quality.T_current_reference
+        guess = start.reference.T_world_camera @ se3.inverse(T_current_reference)
+        found = self._align(start.reference, still, guess, start.information, start.T_world_camera)
+        return found, still
+
     def _see_movers(
-        self, prior: ProbabilityImage, current: ImagePyramid, coarse: Estimate
+        self,
+        prior: ProbabilityImage,
+        current: ImagePyramid,
+        coarse: Estimate,
+        parts: Parts | None,
     ) -> ProbabilityImage:
-        """Join the prior with what stands nearer than the static map (class-agnostic prior)."""
+        """Join the prior with what moves on its own or stands nearer than the static map."""
+        seen = prior
+        if parts is not None:
+            seen = np.maximum(seen, parts.mask(prior.shape, self._config.movers.p_dynamic))
         if self._model is None or not self._config.masked:
-            return prior
+            return seen
         T_current_model = se3.inverse(coarse.T_world_camera) @ self._model.T_world_camera
         maps = self._aligner.residual_maps(self._model.pyramid, current, T_current_model)
-        return np.maximum(prior, self._movers.update(maps, prior.shape))
+        return np.maximum(seen, self._movers.update(maps, prior.shape))
 
     def _refine(
         self, current: ImagePyramid, coarse: Estimate, information: NDArray[np.float64]
@@ -377,7 +449,7 @@ class CameraTracker:
         """Believe a pose; where the camera was lost, only one that is sure or seen twice."""
         start, estimate = attempt.start, attempt.best
         was_lost = self._is_lost or start.is_far
-        is_sure = start.confirms or self._loss.is_sure(estimate.quality)
+        is_sure = start.confirms or self._is_expected(frame, attempt)
         if was_lost and not (is_sure and self._can_be_keyframe(frame, attempt)):
             self._hypothesis = Hypothesis(frame.stamp_ns, estimate.T_world_camera, start)
             return self._lost(frame, attempt)
@@ -386,29 +458,48 @@ class CameraTracker:
             self._motion.reset()
             self._is_lost, self._hypothesis = False, None
         self._motion.update(frame.stamp_ns, estimate.T_world_camera, estimate.quality.covariance)
-        self._loss.accept(estimate.quality)
+        reference = start.reference
+        spread = self._world_covariance(attempt, reference.stamp_ns, reference.T_world_camera)
         is_keyframe = start.is_far or (
             self._needs_keyframe(attempt) and self._can_be_keyframe(frame, attempt)
         )
         if is_keyframe:
+            spread = self._least_covariance(attempt)
             self._become_keyframe(
-                frame, estimate.T_world_camera, attempt.current, attempt.p_dynamic
+                frame, estimate.T_world_camera, attempt.current, attempt.p_dynamic, spread
             )
-        return _result(frame, attempt, TrackingStatus.OK, is_keyframe)
+        return replace(_result(frame, attempt, TrackingStatus.OK, is_keyframe), covariance=spread)
+
+    def _is_expected(self, frame: RgbdFrame, attempt: Attempt) -> bool:
+        """Tell whether the camera was lost just now, and is where it was about to go."""
+        if attempt.start.is_far or self._keyframe is None:
+            return False
+        best = attempt.best
+        return self._motion.expects(frame.stamp_ns, best.T_world_camera, best.quality.covariance)
+
+    def _world_covariance(
+        self, attempt: Attempt, stamp_ns: int, T_world_reference: Pose
+    ) -> NDArray[np.float64]:
+        """Return how far the pose may be off in the world, if it is known by this keyframe."""
+        T_reference_camera = se3.inverse(T_world_reference) @ attempt.best.T_world_camera
+        doubt = self._doubt.get(stamp_ns, np.zeros((6, 6)))
+        return covariance.chained(doubt, T_reference_camera, attempt.covariance)
+
+    def _least_covariance(self, attempt: Attempt) -> NDArray[np.float64]:
+        """Return the same by the surest of the keyframes that look at much the same."""
+        best = attempt.best
+        near = self._places.near(best.T_world_camera, best.quality.depth_m)
+        reference = attempt.start.reference
+        near[reference.stamp_ns] = reference.T_world_camera
+        chains = [self._world_covariance(attempt, *place) for place in near.items()]
+        return min(chains, key=lambda chain: float(np.trace(chain[:3, :3])))
 
     def _lose(self, frame: RgbdFrame, attempt: Attempt) -> TrackingResult:
         """No start led anywhere: the camera is lost, or stays so."""
         if not self._is_lost:
             objection = self._loss.objection(attempt.best.quality)
             _log.warning('lost at stamp %d ns: %s', frame.stamp_ns, objection)
-        # A blurred frame is doubtful, and the next ones are found from where it seems to be; from
-        # a prediction that is older with every frame they would not.
-        found, is_doubtful = attempt.best, self._loss.is_doubtful(attempt.best.quality)
-        self._hypothesis = (
-            Hypothesis(frame.stamp_ns, found.T_world_camera, attempt.start)
-            if is_doubtful
-            else None
-        )
+        self._hypothesis = None
         return self._lost(frame, attempt)
 
     def _lost(self, frame: RgbdFrame, attempt: Attempt) -> TrackingResult:
@@ -421,10 +512,12 @@ class CameraTracker:
         assert self._keyframe is not None
         T_keyframe_world = se3.inverse(self._keyframe.T_world_camera)
         T_keyframe_camera = T_keyframe_world @ attempt.best.T_world_camera
-        return self._choice.is_due(T_keyframe_camera, attempt.coarse.quality.overlap)
+        quality = attempt.coarse.quality
+        sigma_share = self._loss.evidence(quality).sigma_share
+        return self._choice.is_due(T_keyframe_camera, quality.overlap, sigma_share)
 
     def _can_be_keyframe(self, frame: RgbdFrame, attempt: Attempt) -> bool:
-        return self._loss.can_be_aligned_to(frame.depth_m, attempt.p_dynamic)
+        return self._is_whole and self._loss.can_be_aligned_to(frame.depth_m, attempt.p_dynamic)
 
     def _become_keyframe(
         self,
@@ -432,13 +525,17 @@ class CameraTracker:
         T_world_camera: Pose,
         pyramid: ImagePyramid,
         p_dynamic: ProbabilityImage,
+        spread: NDArray[np.float64],
     ) -> None:
+        self._doubt[frame.stamp_ns] = spread
         self._keyframe = Reference(frame.stamp_ns, T_world_camera, pyramid)
         self._tracked[frame.stamp_ns] = T_world_camera
         if len(self._tracked) > _MOST_TRACKED:
             del self._tracked[min(self._tracked)]
         self._choice.begin(frame)
         self._places.add(frame, T_world_camera, p_dynamic)
+        known = {place.stamp_ns for place in self._places} | {frame.stamp_ns}
+        self._doubt = {stamp_ns: self._doubt[stamp_ns] for stamp_ns in known & self._doubt.keys()}
 
 
 def _result(

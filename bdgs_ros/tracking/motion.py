@@ -24,8 +24,13 @@ _log = logging.getLogger(__name__)
 
 Matrix = NDArray[np.float64]
 
-_START_SPEED = 1.0  # m/s, standard deviation of the velocity while nothing is known
-_START_SPIN = 2.0  # rad/s
+_START_SPEED = 0.5  # m/s, standard deviation of the velocity while nothing is known
+_START_SPIN = 1.0  # rad/s
+_LATELY_S = 0.5
+_FASTER, _CALMER, _MOST_UNREST = 2.0, 0.95, 100.0  # of the variance of the acceleration
+_LAG_GAIN = 0.2
+_LAG_VARIANCE = _LAG_GAIN / (2 - _LAG_GAIN)  # of a mean of white noise
+_SURPRISING = 6.0  # times that
 _LEAST_VARIANCE = 1e-10  # of a measurement, so that the innovation can be inverted
 
 
@@ -54,10 +59,12 @@ class MotionPredictor:
         self._config = config
         self._state: _State | None = None
         self._last: tuple[_State, _State] | None = None  # a state and where it was moved to
+        self._unrest, self._lag = 1.0, np.zeros(6)
 
     def reset(self) -> None:
         """Forget pose and velocity."""
         self._state = None
+        self._unrest, self._lag = 1.0, np.zeros(6)
 
     def predict(self, stamp_ns: int) -> tuple[Pose, Matrix]:
         """
@@ -128,9 +135,38 @@ class MotionPredictor:
             return
         innovation = se3.log(se3.inverse(predicted.T_world_camera) @ measured)
         if self._is_outside(innovation, predicted.covariance[:6, :6] + noise):
+            self.reset()
             self._state = self._start(stamp_ns, measured, noise)
             return
+        self._note_surprise(innovation, predicted.covariance[:6, :6], noise)
         self._state = self._correct(predicted, innovation, noise)
+
+    def _note_surprise(self, pulled: Matrix, predicted: Matrix, noise: Matrix) -> None:
+        """
+        Expect more of a camera that accelerates more than expected: by scale or by temper.
+
+        The measured pose was pulled towards the prediction, with their covariances P and R. The
+        images alone would have put it `(P + R) P^-1` times as far off. Single frames may be noise;
+        what lags behind for some frames in one direction is not.
+        """
+        both = predicted + noise
+        off = both @ np.linalg.solve(predicted, pulled)
+        white = np.linalg.solve(np.linalg.cholesky(both), off)
+        self._lag += _LAG_GAIN * (white - self._lag)
+        surprise = float((self._lag**2).max()) / _LAG_VARIANCE
+        if surprise > _SURPRISING:
+            self._unrest = min(self._unrest * _FASTER, _MOST_UNREST)
+        else:
+            self._unrest = max(self._unrest * _CALMER, 1.0)
+
+    def expects(self, stamp_ns: int, T_world_camera: Pose, covariance: Matrix) -> bool:
+        """Tell whether the camera was seen lately, and a measured pose is where it may be now."""
+        if self._state is None or stamp_ns - self._state.stamp_ns > 1e9 * _LATELY_S:
+            return False
+        pose, spread = self.predict(stamp_ns)
+        innovation = se3.log(se3.inverse(pose) @ T_world_camera)
+        squared = float(innovation @ np.linalg.solve(spread + covariance, innovation))
+        return squared <= self._config.gate_sigma**2
 
     def move(self, T_new_old: Pose) -> None:
         """Follow a correction of the world, `T_new_camera = T_new_old @ T_old_camera`."""
@@ -167,7 +203,7 @@ class MotionPredictor:
         # nobody keeps a velocity for long; unseen, the camera is not carried out of the room
         step = se3.exp(state.velocity * min(dt, self._config.coast_s))
         F = np.eye(12)
-        F[:6, :6] = adjoint(se3.inverse(step))
+        F[:6, :6] = se3.adjoint(se3.inverse(step))
         F[:6, 6:] = dt * np.eye(6)
         covariance = F @ state.covariance @ F.T + self._process_noise(dt)
         pose = se3.orthonormalise(state.T_world_camera @ step)
@@ -178,7 +214,8 @@ class MotionPredictor:
         linear = self._config.acceleration_sigma
         angular = self._config.angular_acceleration_sigma
         push = np.vstack([0.5 * dt**2 * np.eye(6), dt * np.eye(6)])
-        return np.asarray(push @ np.diag([linear**2] * 3 + [angular**2] * 3) @ push.T)
+        accelerations = np.diag([linear**2] * 3 + [angular**2] * 3)
+        return np.asarray(self._unrest * push @ accelerations @ push.T)
 
     def _difference(self, last: _State, stamp_ns: int, measured: Pose, noise: Matrix) -> _State:
         """
@@ -220,12 +257,3 @@ class MotionPredictor:
         velocity = kalman.x[6:] if self._config.model == 'kalman' else np.zeros(6)
         covariance = 0.5 * (kalman.P + kalman.P.T)
         return _State(predicted.stamp_ns, pose, velocity, covariance)
-
-
-def adjoint(T_a_b: Pose) -> Matrix:
-    """Return the matrix, shape (6, 6), that takes tangents of b to a: `T exp(x) = exp(Ad x) T`."""
-    rotation = T_a_b[:3, :3]
-    out = np.zeros((6, 6))
-    out[:3, :3] = out[3:, 3:] = rotation
-    out[:3, 3:] = se3.hat(T_a_b[:3, 3]) @ rotation
-    return out

@@ -21,6 +21,7 @@ from bdgs_ros.tracking.features import FeatureExtractor, Features, match
 from bdgs_ros.tracking.pnp import locate
 from bdgs_ros.tracking.word_index import WordIndex, Words
 
+_SAME_VIEW = 0.35  # rad, that two cameras look at much the same
 _METRES_PER_RADIAN = 2.0  # a turn moves the view as far as this at usual depths
 
 
@@ -104,6 +105,16 @@ class Places:
         for i, place in enumerate(self._places):
             if place.stamp_ns in poses:
                 self._places[i] = replace(place, T_world_camera=poses[place.stamp_ns])
+
+    def near(self, T_world_camera: Pose, depth_m: float) -> dict[int, Pose]:
+        """Return the poses by stamp of the places that look at much the same from there."""
+        if not self._places:
+            return {}
+        poses = np.array([place.T_world_camera for place in self._places])
+        apart = np.linalg.norm(poses[:, :3, 3] - T_world_camera[:3, 3], axis=1) / depth_m
+        turned = np.arccos(np.clip(poses[:, :3, 2] @ T_world_camera[:3, 2], -1, 1))
+        chosen = np.flatnonzero(apart + turned < _SAME_VIEW)
+        return {self._places[i].stamp_ns: poses[i] for i in chosen}
 
     def prepare(self, most: int = 1) -> None:
         """Extract the features of so many places that have none yet."""

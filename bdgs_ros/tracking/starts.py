@@ -51,6 +51,8 @@ class Attempt:
     coarse: Estimate
     best: Estimate
     p_dynamic: ProbabilityImage
+    covariance: NDArray[np.float64]
+    """Shape (6, 6): of the best estimate relative to the reference of the start."""
 
 
 @dataclass(frozen=True)

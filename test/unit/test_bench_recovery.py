@@ -21,7 +21,9 @@ def watch_of(fault, count: int, lost: range, off: range) -> Watch:
     """Return a run that is exact, but has no pose in `lost` and is 0.3 m off in `off`."""
     true = fault.frames.ground_truth.positions[:count]
     positions = [p + np.array([0, 0.3, 0]) if i in off else p for i, p in enumerate(true)]
-    evidence = [Evidence(0.9, 0.2 if i in lost else 1.0, 0.7, 1.0, 0.01) for i in range(count)]
+    evidence = [
+        Evidence(0.9, 0.7, 0.7, 2.0, 4.0 if i in lost else 0.02, 0.01) for i in range(count)
+    ]
     return Watch(positions, [i not in lost for i in range(count)], [None, *evidence[1:]], [1.0])
 
 
@@ -49,8 +51,8 @@ def test_loss_and_recovery_are_timed() -> None:
     assert row['to_found_s'] == pytest.approx(4 * 0.033)
     assert (row['false_lost'], row['wrong_ok'], row['never_found']) == (0, 0, 0)
     assert row['after_cm'] == pytest.approx(0.0, abs=1e-6)
-    assert row['bad_relative_ratio'][0] == 0.2
-    assert row['good_relative_ratio'][-1] == 1.0
+    assert row['bad_sigma_share'][0] == 2.0
+    assert row['good_sigma_share'][-1] == 0.01
 
 
 def test_wrong_poses_are_counted_and_do_not_count_as_found() -> None:

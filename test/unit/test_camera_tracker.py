@@ -237,8 +237,7 @@ def test_after_a_jump_back_the_camera_is_found_at_once_or_nearly(two_places: tup
     tracker = CameraTracker(CONFIG)
     apart = np.linalg.norm((se3.inverse(poses[0]) @ poses[11])[:3, 3])
     assert apart > 0.2
-    elsewhere = start_elsewhere(tracker, frames, poses)
-    assert elsewhere.is_keyframe
+    start_elsewhere(tracker, frames, poses)
     results = [tracker.process(at(frames[i], 30 + i)) for i in range(6)]
     wrong = [
         i

@@ -28,8 +28,8 @@ class Oracle:
         T = se3.inverse(self._poses[current]) @ self._poses[reference]
         if current == self._wrong:
             T = se3.exp(np.array([0.3, 0, 0, 0, 0, 0])) @ T
-        shares = {'inlier_ratio': 0.9, 'coverage': 0.9, 'overlap': 1.0}
-        residuals = {'median_intensity': 0.0, 'median_depth_sigma': 0.0}
+        shares = {'inlier_ratio': 0.9, 'texture': 0.9, 'coverage': 0.9, 'overlap': 1.0}
+        residuals = {'depth_m': 2.0, 'median_intensity': 0.0, 'median_depth_sigma': 0.0}
         return AlignResult(
             T,
             np.eye(6),

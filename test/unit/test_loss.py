@@ -1,4 +1,4 @@
-"""The test for loss: limits, and what was usual before."""
+"""The test for loss: what the images leave open."""
 
 from __future__ import annotations
 
@@ -12,75 +12,35 @@ from bdgs_ros.tracking.loss import LossTest
 
 
 def aligned(
-    inliers: float = 0.9, coverage: float = 0.7, gain: float = 1.0, sigma_m: float = 0.01
+    inliers: float = 0.9, sigma_m: float = 0.01, sigma_rad: float = 0.002, depth_m: float = 2.0
 ) -> AlignResult:
-    covariance = np.diag([1e-6, 1e-6, sigma_m**2, 1e-8, 1e-8, 1e-8])
+    covariance = np.diag([1e-6, 1e-6, sigma_m**2, 1e-8, sigma_rad**2, 1e-8])
     return AlignResult(
-        se3.identity(), covariance, inliers, coverage, 0.9, 0.01, 0.5, 5, True, gain, 0.0,
-        np.zeros(3),
+        T_current_reference=se3.identity(), covariance=covariance, inlier_ratio=inliers,
+        texture=0.7, coverage=0.7, overlap=0.9, depth_m=depth_m, median_intensity=0.01,
+        median_depth_sigma=0.5, iterations=5, converged=True, gain=1.0, bias=0.0,
+        depth_pattern=np.zeros(3),
     )  # fmt: skip
 
 
-def usual(ratio: float) -> LossTest:
-    test = LossTest(LossConfig())
-    for _ in range(10):
-        test.accept(aligned(ratio))
-    return test
-
-
-def test_a_good_frame_is_believed() -> None:
-    assert usual(0.9).objection(aligned(0.85)) == ''
-    assert LossTest(LossConfig()).objection(aligned(0.55)) == ''
+@pytest.mark.parametrize(
+    'quality', [aligned(), aligned(inliers=0.5), aligned(sigma_m=0.4, depth_m=12.0)]
+)
+def test_a_good_frame_is_believed(quality: AlignResult) -> None:
+    assert LossTest(LossConfig()).objection(quality) == ''
 
 
 @pytest.mark.parametrize(
-    ('quality', 'word'),
+    ('quality', 'words'),
     [
-        (aligned(inliers=0.45), '45 % inliers'),
-        (aligned(inliers=0.6), 'fell from 90 to 60 %'),
-        (aligned(coverage=0.03), '3.0 % of the image'),
-        (aligned(gain=0.05), 'gain 0.05'),
-        (aligned(gain=-0.8), 'gain -0.80'),
-        (aligned(gain=3.5), 'gain 3.50'),
-        (aligned(sigma_m=0.4), '0.40 m'),
+        (aligned(inliers=0.15), '15 % inliers'),
+        (aligned(sigma_m=0.4), 'position open to 0.40 m at a depth of 2.0 m'),
+        (aligned(sigma_m=0.06, depth_m=0.4), 'position open to 0.06 m'),
+        (aligned(sigma_rad=0.2), 'direction open to 11 deg'),
     ],
 )
-def test_each_limit_objects_in_words(quality: AlignResult, word: str) -> None:
-    assert word in usual(0.9).objection(quality)
-
-
-def test_what_is_usual_decides_what_is_too_little() -> None:
-    """A noisy sensor agrees less with every map; that is no loss."""
-    assert usual(0.9).objection(aligned(0.6))
-    assert not usual(0.65).objection(aligned(0.6))
-
-
-def test_a_turn_that_blurs_excuses_a_little() -> None:
-    test = usual(0.9)
-    assert test.objection(aligned(inliers=0.6))
-    test.turn_rad_s = 2.0
-    assert test.objection(aligned(inliers=0.6)) == ''
-    assert test.objection(aligned(inliers=0.4))  # the limit for all frames stands
-    high = LossTest(LossConfig(inlier_ratio=0.1))
-    for _ in range(10):
-        high.accept(aligned(0.9))
-    high.turn_rad_s = 100.0
-    assert high.objection(aligned(inliers=0.45))
-
-
-def test_doubtful_is_what_only_the_frames_before_speak_against() -> None:
-    test = usual(0.9)
-    assert test.is_doubtful(aligned(inliers=0.6))
-    for wrong in (aligned(0.45), aligned(coverage=0.03), aligned(gain=5), aligned(sigma_m=0.4)):
-        assert not test.is_doubtful(wrong)
-
-
-def test_sure_is_as_good_as_before_the_loss() -> None:
-    test = usual(0.9)
-    assert test.is_sure(aligned(0.85))
-    assert not test.is_sure(aligned(0.75))
-    test.reset()
-    assert test.is_sure(aligned(0.75))
+def test_each_limit_objects_in_words(quality: AlignResult, words: str) -> None:
+    assert words in LossTest(LossConfig()).objection(quality)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import pytest
 
 from bdgs_ros.core import se3
 from bdgs_ros.core.config.tracking import MotionConfig
-from bdgs_ros.tracking.motion import MotionPredictor, adjoint
+from bdgs_ros.tracking.motion import MotionPredictor
 
 PERIOD_NS = 33_000_000
 VELOCITY = np.array([0.4, -0.1, 0.2, 0.3, 0.5, -0.2])
@@ -124,7 +124,7 @@ def test_before_the_first_pose_the_prediction_is_the_origin() -> None:
 def test_adjoint_moves_a_tangent_to_the_other_side() -> None:
     T = se3.exp(np.array([0.3, -0.2, 0.5, 0.4, 0.1, -0.6]))
     xi = np.array([0.01, 0.02, -0.01, 0.03, -0.02, 0.01])
-    assert np.allclose(T @ se3.exp(xi), se3.exp(adjoint(T) @ xi) @ T)
+    assert np.allclose(T @ se3.exp(xi), se3.exp(se3.adjoint(T) @ xi) @ T)
 
 
 def test_an_unseen_camera_does_not_run_away() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -205,13 +206,19 @@ def test_a_start_pose_is_seven_numbers(tmp_path, capsys, text):
     assert "expects 'x y z qx qy qz qw'" in capsys.readouterr().err
 
 
+def twice(frame):
+    """A pose far from where the camera was seen is believed once a second frame says the same."""
+    return frame, replace(frame, stamp_ns=frame.stamp_ns + 33_000_000)
+
+
 def test_a_loaded_map_is_the_start_of_a_run(finished):
     from bdgs_ros.core.types import TrackingStatus
     from bdgs_ros.pipeline import BdgsSlam
 
     slam = BdgsSlam(CONFIG)
     slam.start_from(finished / 'map.ply', CAMERA, se3.exp(np.array([0.02, 0, 0, 0, 0.01, 0])))
-    result = slam.process(a_keyframe(1).frame)
+    unsure, result = (slam.process(frame) for frame in twice(a_keyframe(1).frame))
+    assert unsure.tracking.status is TrackingStatus.LOST
     assert result.tracking.status is TrackingStatus.OK
     assert result.tracking.is_keyframe
     T_error = se3.inverse(a_keyframe(1).T_world_camera) @ result.tracking.T_world_camera
@@ -232,7 +239,7 @@ def test_a_view_that_fits_nowhere_is_lost(finished):
     depth = np.full(CAMERA.shape, 0.5, np.float32)
     covered = RgbdFrame(5, noise, depth, CAMERA)
     assert slam.process(covered).tracking.status is TrackingStatus.LOST
-    found = slam.process(a_keyframe(0).frame)
+    _, found = (slam.process(frame) for frame in twice(a_keyframe(0).frame))
     assert found.tracking.status is TrackingStatus.OK
     assert len(slam.mapper.keyframes) == 3
     assert isinstance(slam.mapper, Mapper)

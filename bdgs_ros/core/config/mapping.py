@@ -67,8 +67,8 @@ class InsertConfig:
         4, 'radius of the largest window in which planes are fitted', unit='px', low=1, high=32
     )
     opacity: float = param(0.7, 'opacity of a new Gaussian', low=0.01, high=0.99)
-    min_depth: float = param(0.3, 'nearer depths are not used', unit='m', low=0.0)
-    max_depth: float = param(6.0, 'farther depths are not used', unit='m', low=0.1)
+    min_depth: float = param(0.15, 'nearer depths are not used', unit='m', low=0.0)
+    max_depth: float = param(30.0, 'farther depths are not used', unit='m', low=0.1)
     edge: float = param(
         0.04, 'depth steps to a neighbour above this share of z are edges', low=0.0, high=1.0
     )

@@ -1,0 +1,144 @@
+"""
+Which part of the view is the world, where parts of it move in different ways.
+
+Every square of the image says by its own normal equations which small motion it has seen
+(`Aligner.cells`). A rigid part is a set of squares that one motion explains: motions are proposed
+by neighbouring squares (RANSAC that is small enough to try all of them). The part with the most
+pixels need not be the world: a door or a person may fill the view. What tells the world is how
+much surface, in square metres, agrees with a motion, and whether the camera was expected to move
+like that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bdgs_ros.core.config.tracking import PartsConfig
+from bdgs_ros.core.types import ProbabilityImage
+from bdgs_ros.tracking.align import Cells
+
+Array = NDArray[np.float64]
+
+_FEWEST = 6  # points of a square that is asked
+_LIKELY, _ROUNDS = 4, 3  # motions that are refined, and how often
+_LOOSE = np.diag([0.1**-2] * 3 + [0.1**-2] * 3)  # m and rad: a proposal stays in the linear range
+_LEAST_NOISE = 0.3  # residuals over those of the sensor
+
+
+@dataclass(frozen=True)
+class Parts:
+    """How the world moves, and which squares do not."""
+
+    step: Array
+    """Shape (6,): xi of the world, `exp(xi) @ T_current_reference`."""
+    moved: NDArray[np.bool_]
+    """Shape (rows, columns)."""
+    cells: Cells
+    is_other: bool
+    """Whether the world is another part than the one that was aligned."""
+
+    def mask(self, shape: tuple[int, int], p_dynamic: float) -> ProbabilityImage:
+        """Return P(dynamic) x 255 of an image of this shape."""
+        value = np.uint8(round(255 * p_dynamic))
+        image = np.where(self.moved, value, np.uint8(0))
+        size = (shape[1], shape[0])
+        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST), np.uint8)
+
+
+def find_world(
+    cells: Cells, expected: Array, information: Array, config: PartsConfig
+) -> Parts | None:
+    """
+    Find the world's motion among those that squares propose.
+
+    Parameters
+    ----------
+    cells : Cells
+        Of the present image, at the pose that was found.
+    expected : ndarray, shape (6,)
+        xi of the predicted pose, `exp(xi) @ T_current_reference`.
+    information : ndarray, shape (6, 6)
+        How sure that is.
+    config : PartsConfig
+        Limits.
+
+    Returns
+    -------
+    parts : Parts or None
+        None where too little is seen to tell.
+
+    """
+    asked = (cells.seen >= _FEWEST) & (cells.weight > 0)
+    if asked.sum() < config.least:
+        return None
+    motions = np.vstack([np.zeros((1, 6)), expected[None], _proposals(cells, asked)])
+    costs = _cost(cells, motions)
+    least = costs.min(axis=0)
+    scale = np.maximum(cells.weight, 1e-9) * _noise(cells, asked, least)
+    area = np.where(asked, cells.seen * cells.depth_m**2, 0.0)
+    area /= area.sum()
+
+    def loss(motions: Array, costs: Array) -> Array:
+        unexplained = np.minimum((costs - least) / scale, 1.0) @ area
+        off = motions - expected
+        surprise = 0.5 * np.einsum('ni,ij,nj->n', off, information, off)
+        return np.asarray(config.evidence * unexplained + np.minimum(surprise, config.surprise))
+
+    losses = loss(motions, costs)
+    step, is_other = np.zeros(6), False
+    if losses[0] - losses.min() > config.margin:
+        likely = motions[np.argsort(losses)[:_LIKELY]]
+        for _ in range(_ROUNDS):
+            likely = np.stack([_refined(cells, step, least, scale, asked) for step in likely])
+        losses = loss(likely, _cost(cells, likely))
+        step, is_other = likely[np.argmin(losses)], True
+    excess = (_cost(cells, step[None])[0] - least) / scale
+    moved = asked & (excess > config.moved)
+    return Parts(step, moved.reshape(-1, cells.columns), cells, is_other)
+
+
+def _noise(cells: Cells, asked: NDArray[np.bool_], least: Array) -> float:
+    """Return how large residuals are that some motion explains, over those of the sensor."""
+    return max(float(np.median(least[asked] / cells.weight[asked])), _LEAST_NOISE)
+
+
+def _proposals(cells: Cells, asked: NDArray[np.bool_]) -> Array:
+    """Return the motions that neighbouring squares see together, shape (N, 6)."""
+    squares = (cells.information * asked[:, None, None]).reshape(-1, cells.columns, 36)
+    H = _windows(squares).reshape(-1, 6, 6)
+    g = _windows((cells.gradient * asked[:, None]).reshape(-1, cells.columns, 6)).reshape(-1, 6)
+    return np.asarray(-np.linalg.solve(H + _LOOSE, g[..., None])[..., 0])
+
+
+def _windows(values: Array) -> Array:
+    """Sum over windows of 4 x 4 squares, half of them overlapping; shape (rows, columns, K)."""
+    blocks = blocks_of_two(values)
+    return np.asarray(blocks[1:, 1:] + blocks[:-1, 1:] + blocks[1:, :-1] + blocks[:-1, :-1])
+
+
+def blocks_of_two(values: Array) -> Array:
+    """Sum over 2 x 2 squares, shape (rows, columns, K); an odd row or column is left out."""
+    rows, columns = values.shape[0] // 2, values.shape[1] // 2
+    four = values[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2, -1)
+    return np.asarray(four.sum(axis=(1, 3)))
+
+
+def _cost(cells: Cells, motions: Array) -> Array:
+    """Return the cost of each square at each motion, to second order, shape (N, C)."""
+    linear = 2 * motions @ cells.gradient.T
+    pairs = (motions[:, :, None] * motions[:, None, :]).reshape(-1, 36)
+    square = pairs @ cells.information.reshape(-1, 36).T
+    return np.asarray(np.maximum(cells.cost + linear + square, 0.0))
+
+
+def _refined(
+    cells: Cells, step: Array, least: Array, scale: Array, asked: NDArray[np.bool_]
+) -> Array:
+    """Let the squares that agree with a motion decide on it."""
+    members = asked & ((_cost(cells, step[None])[0] - least) / scale < 1.0)
+    H = cells.information[members].sum(axis=0)
+    return np.asarray(-np.linalg.solve(H + _LOOSE, cells.gradient[members].sum(axis=0)))
