@@ -21,6 +21,7 @@ from bdgs_ros.core.threads import one_thread_in_cv2
 from bdgs_ros.core.types import RgbdFrame, TrackingResult, Trajectory
 from bdgs_ros.data.trajectory_io import write_trajectory
 from bdgs_ros.eval import pictures, plots, provenance, scores, trajectory
+from bdgs_ros.eval.honesty import honesty_metrics
 from bdgs_ros.eval.labels import LabelScore, score_labels
 from bdgs_ros.eval.metric import Metric, as_dict, dump_json
 from bdgs_ros.eval.recorder import Recorder, RunResult
@@ -218,6 +219,8 @@ def write_results(
     expected = len(result.rows) if frames_expected is None else frames_expected
     ate, notes = _compare(ground_truth, est, expected)
     found += _trajectory_metrics(est, expected, ground_truth, ate)
+    if ground_truth is not None and ate is not None:
+        found += honesty_metrics(ground_truth, est, result.rows)
     found += more
     views: list[scores.View] = []
     if static_map is not None:

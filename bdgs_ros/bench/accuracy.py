@@ -58,6 +58,8 @@ _COLUMNS = {
     'rpe_second_deg': 'rpe_rotation_second_rmse',
     'keyframes': 'keyframes',
     'frames': 'frames_in',
+    'nees': 'nees',
+    'beyond_3_sigma_pct': 'beyond_3_sigma',
     'tracking_ms': 'tracking_median',
     'tracking_p95_ms': 'tracking_p95',
 }
@@ -65,9 +67,9 @@ _COLUMNS = {
 
 def cells(options: Options) -> list[Cell]:
     """List the whole method everywhere, then each switch on the real and some synthetic ones."""
-    from bdgs_ros.data.synth import scenarios
+    from bdgs_ros.data.synth import field_scenarios, scenarios
 
-    names = _QUICK_SCENARIOS if options.quick else tuple(scenarios())
+    names = _QUICK_SCENARIOS if options.quick else scenarios() + field_scenarios()
     found = _on(FULL, names, options.seeds, options)
     for switch in () if options.quick else known_switches():
         names = _SWITCHED_ELSEWHERE.get(switch, _SWITCHED)

@@ -14,7 +14,7 @@ from bdgs_ros.core.errors import DatasetError, ModelError
 
 SYNTH_FRAMES = 300
 SYNTH_FRAMES_QUICK = 60
-SYNTH_LONGER = {'loop_room': 450}  # frames until the story is told: the camera is back
+SYNTH_LENGTHS = {'loop_room': 450, 'low_rate': 75}  # frames: until it is back; 15 s
 REAL_FRAMES_QUICK = 60
 WEIGHTS = Path('models') / 'yolov5n-320.onnx'
 _SYNTH = 'synth_'
@@ -96,7 +96,7 @@ def _record(path: Path, scenario: str, seed: int, frames: int, camera: SynthCame
             seed,
             frames,
             size=(camera.width, camera.height),
-            rate_hz=camera.rate_hz,
+            rate_hz=None if camera == SynthCamera() else camera.rate_hz,
             progress=lambda done, total: bar.update(done - bar.n),
         )
 
@@ -108,7 +108,7 @@ def real_settings(options: Options) -> dict[str, Any]:
 
 def synth_settings(scenario: str, options: Options) -> dict[str, Any]:
     """Return what a cell on a synthetic recording is known by."""
-    frames = SYNTH_LONGER.get(scenario, SYNTH_FRAMES)
+    frames = SYNTH_LENGTHS.get(scenario, SYNTH_FRAMES)
     return {'kind': 'synth', 'frames': SYNTH_FRAMES_QUICK if options.quick else frames}
 
 

@@ -11,7 +11,9 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from bdgs_ros.data.synth import RecordingSummary, scenarios, write_recording
+from bdgs_ros.data.synth import RecordingSummary, field_scenarios, scenarios, write_recording
+
+_NAMES = scenarios() + field_scenarios()
 
 NAME = 'synth'
 HELP = 'make a synthetic RGB-D recording with exact truth'
@@ -21,15 +23,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the subcommand."""
     parser.add_argument('folder', type=Path, metavar='DIR', help='folder to make')
     parser.add_argument(
-        '--scenario', required=True, choices=scenarios(), metavar='NAME',
-        help='one of: ' + ', '.join(scenarios()),
+        '--scenario', required=True, choices=_NAMES, metavar='NAME',
+        help='one of: ' + ', '.join(_NAMES),
     )  # fmt: skip
     parser.add_argument('--seed', type=int, default=0, help='seed of all that varies (default: 0)')
     parser.add_argument('--frames', type=int, default=300, help='length (default: 300)')
     parser.add_argument(
         '--size', type=_size, default=(640, 480), metavar='WxH', help='pixels (default: 640x480)'
     )
-    parser.add_argument('--rate', type=float, default=30.0, help='frames per second (default: 30)')
+    parser.add_argument('--rate', type=float, help='frames per second (default: 30; low_rate: 5)')
     parser.add_argument('--jobs', type=int, help='processes (default: one per processor)')
     parser.add_argument('--force', action='store_true', help='replace a recording that is there')
     parser.add_argument('--json', action='store_true', help='print the summary as JSON')

@@ -32,6 +32,8 @@ class FrameRow:
     inlier_ratio: float
     overlap: float
     times_ms: Mapping[str, float]
+    covariance: NDArray[np.float64] | None = None
+    """Shape (6, 6), of the camera's tangent; None where nobody said it."""
 
 
 @dataclass(frozen=True)
@@ -124,6 +126,7 @@ class Recorder:
                 tracking.inlier_ratio,
                 tracking.overlap,
                 dict(times_ms),
+                tracking.covariance.copy(),
             )
         )
 

@@ -14,6 +14,7 @@ from bdgs_ros.core import se3
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.errors import DatasetError
 from bdgs_ros.data.camera_file import read_camera_file
+from bdgs_ros.data.layouts import open_sequence
 from bdgs_ros.data.synth import SynthTruth, room, scenarios, write_recording, writer
 from bdgs_ros.data.synth.raster import SampleGrid
 from bdgs_ros.data.synth.render import FrameRenderer, draw
@@ -351,3 +352,32 @@ def test_command_prints_one_line_or_json(tmp_path, capsys):
     assert summary['frames'] == 2 and summary['max_coverage'] == 0.0
     with pytest.raises(SystemExit):
         parser.parse_args([str(tmp_path / 'c'), '--scenario', 'static', '--size', 'big'])
+
+
+def test_a_hall_is_the_room_at_four_times_its_size(tmp_path):
+    """Images are those of the room; what counts metres says four times as many."""
+    made = {}
+    for name in ('hall', 'static'):
+        write_recording(tmp_path / name, name, 1, 8, size=(64, 48), rate_hz=4.0, jobs=1)
+        sequence = open_sequence(tmp_path / name)
+        truth = SynthTruth(tmp_path / name)
+        made[name] = (
+            np.median(sequence[0].depth_m),
+            np.median(truth.static_depth(truth.stamps_ns[0])),
+            np.linalg.norm(np.ptp(sequence.ground_truth.positions, axis=0)),
+        )
+    depth, static, _ = np.array(made['hall']) / made['static']
+    assert depth == pytest.approx(4.0, rel=0.1) and static == pytest.approx(4.0, rel=0.1)
+    assert made['hall'][2] > 2 * made['static'][2]
+
+
+def test_field_scenarios_tell_their_stories(tmp_path):
+    before, after = coverage('crowded_start', 0, [1.0, 8.0])
+    assert before > 0.7 and after < 0.05
+    resting, swinging = coverage('door', 0, [2.0, 5.7])
+    assert resting == 0 and swinging > 0.15
+    summary = write_recording(tmp_path / 'slow', 'low_rate', 0, 3, size=(64, 48), jobs=1)
+    assert summary.duration_s == pytest.approx(0.6)
+    board = write_recording(tmp_path / 'board', 'blank_start', 0, 2, size=(64, 48), jobs=1)
+    grey = open_sequence(tmp_path / 'board')[0].color.mean(axis=2)
+    assert board.mean_coverage == 0 and np.std(grey) < 12

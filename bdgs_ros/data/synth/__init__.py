@@ -5,8 +5,8 @@ Synthetic RGB-D recordings with exact truth.
 written in `bdgs_ros.data.synth.truth`.
 """
 
-from bdgs_ros.data.synth.scenarios import scenarios
+from bdgs_ros.data.synth.scenarios import field_scenarios, scenarios
 from bdgs_ros.data.synth.truth import SynthTruth
 from bdgs_ros.data.synth.writer import RecordingSummary, write_recording
 
-__all__ = ['RecordingSummary', 'SynthTruth', 'scenarios', 'write_recording']
+__all__ = ['RecordingSummary', 'SynthTruth', 'field_scenarios', 'scenarios', 'write_recording']

@@ -21,6 +21,7 @@ Motion = Callable[[float, Array], tuple[Array, Array]]
 _REST_S = (0.3, 1.3)  # the motion fades in between these times
 _TURN_RAD_S = np.radians(30)  # of a camera that turns round: 12 s until it is back
 _TURN_RADIUS_M = 0.3
+_ASIDE_S, _ASIDE_RAD = (1.5, 4.0), np.radians(95)  # of a camera that starts before a board
 
 
 def look_at(position: Array, target: Array) -> Array:
@@ -121,6 +122,8 @@ class CameraPath:
             return self._on_halfsphere(time_s, fade)
         if self.kind == 'round':
             return self._round(time_s, fade)
+        if self.kind == 'turn_in':
+            return self._turn_in(time_s, fade)
         offset, angles = _MOTIONS[self.kind](time_s, self.phase)
         T = look_at(self.position, self.target)
         T[:3, 3] += T[:3, :3] @ (fade * offset)
@@ -146,6 +149,18 @@ class CameraPath:
         centre = self.position + np.array([0.7, 0.0, 0.0])
         at = centre + _TURN_RADIUS_M * out + [0, 0, 0.08 * fade * _wave(t, 5.0, self.phase[2])]
         return self._held(look_at(at, at + out - [0, 0, np.tan(dip)]), t, fade)
+
+    def _turn_in(self, t: float, fade: float) -> Array:
+        """Look aside at first, past the right shoulder, then turn to the target."""
+        away = 1 - np.clip((t - _ASIDE_S[0]) / (_ASIDE_S[1] - _ASIDE_S[0]), 0, 1)
+        x = away * away * (3 - 2 * away)
+        T = look_at(self.position, self.target)
+        turn = Rotation.from_rotvec([0.0, 0.0, -x * _ASIDE_RAD]).as_matrix()
+        T[:3, :3] = turn @ T[:3, :3]
+        offset, angles = _gentle(t, self.phase)
+        T[:3, 3] += T[:3, :3] @ (fade * offset)
+        T[:3, :3] = T[:3, :3] @ Rotation.from_rotvec(fade * angles).as_matrix()
+        return T
 
     def _held(self, T: Array, t: float, fade: float) -> Array:
         """Add the tremor of a hand."""

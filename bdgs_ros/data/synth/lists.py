@@ -19,9 +19,9 @@ from bdgs_ros.data.synth.sensor import DEPTH_SCALE
 from bdgs_ros.data.synth.truth import stamp_text
 
 
-def _pose_row(stamp_ns: int, T: NDArray[np.float64]) -> str:
+def _pose_row(stamp_ns: int, T: NDArray[np.float64], scale: float = 1.0) -> str:
     position, quat = se3.to_position_quat_xyzw(T)
-    return ' '.join([stamp_text(stamp_ns), *(f'{v:.9f}' for v in (*position, *quat))])
+    return ' '.join([stamp_text(stamp_ns), *(f'{v:.9f}' for v in (*(scale * position), *quat))])
 
 
 def write_lists(plan: RecordingPlan, world: World, folder: Path, gains: Sequence[float]) -> None:
@@ -31,23 +31,23 @@ def write_lists(plan: RecordingPlan, world: World, folder: Path, gains: Sequence
         rows = [f'{stamp_text(s)} {kind}/{stamp_text(s)}.png' for s in stamps]
         _write_text(folder / f'{kind}.txt', [f'# {title}', '# timestamp filename', *rows])
     path = world.camera_path
-    poses = [_pose_row(s, path.pose(plan.time_s(k))) for k, s in enumerate(stamps)]
+    poses = [_pose_row(s, path.pose(plan.time_s(k)), plan.scale) for k, s in enumerate(stamps)]
     header = ['# ground truth trajectory', '# timestamp tx ty tz qx qy qz qw']
     for name in ('groundtruth.txt', 'truth/groundtruth.txt'):
         _write_text(folder / name, header + poses)
     rows = [f'{stamp_text(s)} {g:.6f}' for s, g in zip(stamps, gains, strict=True)]
     _write_text(folder / 'truth/exposure.txt', ['# timestamp gain', *rows])
-    _write_text(folder / 'camera.yaml', _camera_yaml(plan.camera))
+    _write_text(folder / 'camera.yaml', _camera_yaml(plan.camera, DEPTH_SCALE / plan.scale))
 
 
-def _camera_yaml(camera: PinholeCamera) -> list[str]:
+def _camera_yaml(camera: PinholeCamera, depth_scale: float) -> list[str]:
     rows = [(key, getattr(camera, key)) for key in ('width', 'height', 'fx', 'fy', 'cx', 'cy')]
     return [
         '# made by bdgs synth',
         'camera:',
         *(f'  {key}: {value!r}' for key, value in rows),
         f'  distortion: {list(camera.distortion)}',
-        f'  depth_scale: {DEPTH_SCALE}',
+        f'  depth_scale: {depth_scale:g}',
     ]
 
 
@@ -81,6 +81,7 @@ def _describe(item: SceneObject, plan: RecordingPlan) -> dict[str, Any]:
             [start + float(np.clip(t, *ends)) for t in interval] for interval in item.moving
         ],
         'poses': [
-            _pose_row(plan.stamp_ns(k), item.T_world_object(plan.time_s(k))) for k in frames
+            _pose_row(plan.stamp_ns(k), item.T_world_object(plan.time_s(k)), plan.scale)
+            for k in frames
         ],
     }

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.errors import DatasetError
-from bdgs_ros.data.synth.scenarios import World, make_world, scenarios
+from bdgs_ros.data.synth.scenarios import World, find_scenario, make_world
 
 FIRST_STAMP_NS = 1000 * 10**9
 _FR3 = (640, 480, 535.4, 539.2, 320.1, 247.6)
@@ -25,10 +25,7 @@ class RecordingPlan:
 
     def validate(self) -> None:
         """Raise `DatasetError` for a plan that cannot be recorded."""
-        if self.scenario not in scenarios():
-            raise DatasetError(
-                f"no scenario '{self.scenario}'; there are: {', '.join(scenarios())}"
-            )
+        find_scenario(self.scenario)
         if self.frames < 1 or self.seed < 0 or not 0 < self.rate_hz <= 1000:
             raise DatasetError(
                 f'frames {self.frames}, seed {self.seed}, rate {self.rate_hz:g} Hz: expected '
@@ -38,6 +35,11 @@ class RecordingPlan:
             raise DatasetError(
                 f'size {self.width}x{self.height}: expected 32 to 4096 pixels each way'
             )
+
+    @property
+    def scale(self) -> float:
+        """Metres per metre of the room."""
+        return find_scenario(self.scenario).scale
 
     @property
     def camera(self) -> PinholeCamera:

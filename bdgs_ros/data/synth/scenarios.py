@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bdgs_ros.core.errors import DatasetError
+from bdgs_ros.data.synth import field
 from bdgs_ros.data.synth.camera_path import CameraPath, camera_path
 from bdgs_ros.data.synth.movers import (
     BOX_SIZE_M,
@@ -174,22 +175,54 @@ def _nobody(layout: Layout, rng: np.random.Generator, duration_s: float) -> list
     return []
 
 
-_SCENARIOS: dict[str, tuple[str, Cast]] = {
-    'static': ('survey', _nobody),
-    'walking_static': ('handheld', _two_walkers_and_ball),
-    'walking_xyz': ('xyz', _two_walkers_and_ball),
-    'walking_rpy': ('rpy', _two_walkers_and_ball),
-    'walking_halfsphere': ('halfsphere', _two_walkers_and_ball),
-    'crowd': ('gentle', _crowd),
-    'unknown_box': ('gentle', _unknown_box),
-    'chair_moved': ('gentle', _chair_moved),
-    'loop_room': ('round', _walkers_all_round),
+@dataclass(frozen=True)
+class Scenario:
+    """How the camera moves, who else does, and what the recording is like."""
+
+    motion: str
+    cast: Cast
+    scale: float = 1.0
+    """Metres per metre of the room: a hall, or a corner of a table, with a sensor for that."""
+    rate_hz: float = 30.0
+
+
+_PAPER = {
+    'static': Scenario('survey', _nobody),
+    'walking_static': Scenario('handheld', _two_walkers_and_ball),
+    'walking_xyz': Scenario('xyz', _two_walkers_and_ball),
+    'walking_rpy': Scenario('rpy', _two_walkers_and_ball),
+    'walking_halfsphere': Scenario('halfsphere', _two_walkers_and_ball),
+    'crowd': Scenario('gentle', _crowd),
+    'unknown_box': Scenario('gentle', _unknown_box),
+    'chair_moved': Scenario('gentle', _chair_moved),
+    'loop_room': Scenario('round', _walkers_all_round),
 }
+_FIELD = {
+    'door': Scenario('gentle', field.door),
+    'crowded_start': Scenario('gentle', field.crowded_start),
+    'blank_start': Scenario('turn_in', field.board),
+    'low_rate': Scenario('xyz', _two_walkers_and_ball, rate_hz=5.0),
+    'hall': Scenario('survey', _nobody, scale=4.0),
+    'close_up': Scenario('survey', _nobody, scale=0.15),
+}
+_SCENARIOS = {**_PAPER, **_FIELD}
 
 
 def scenarios() -> tuple[str, ...]:
-    """Return the names of the scenarios."""
-    return tuple(_SCENARIOS)
+    """Return the names of the scenarios that are like the recordings of the paper."""
+    return tuple(_PAPER)
+
+
+def field_scenarios() -> tuple[str, ...]:
+    """Return the names of those that are like reports from the field."""
+    return tuple(_FIELD)
+
+
+def find_scenario(name: str) -> Scenario:
+    """Return a scenario; `DatasetError` if there is none of this name."""
+    if name not in _SCENARIOS:
+        raise DatasetError(f"no scenario '{name}'; there are: {', '.join(_SCENARIOS)}")
+    return _SCENARIOS[name]
 
 
 def make_world(scenario: str, seed: int, duration_s: float) -> World:
@@ -199,7 +232,7 @@ def make_world(scenario: str, seed: int, duration_s: float) -> World:
     Parameters
     ----------
     scenario : str
-        One of `scenarios()`.
+        One of `scenarios()` or `field_scenarios()`.
     seed : int
         Not negative; varies room, textures, people, paths and camera.
     duration_s : float
@@ -212,12 +245,10 @@ def make_world(scenario: str, seed: int, duration_s: float) -> World:
         If there is no such scenario.
 
     """
-    if scenario not in _SCENARIOS:
-        raise DatasetError(f"no scenario '{scenario}'; there are: {', '.join(_SCENARIOS)}")
-    motion, cast = _SCENARIOS[scenario]
+    found = find_scenario(scenario)
     layout = make_layout(np.random.default_rng([seed, 0]))
     rng = np.random.default_rng([seed, 1, zlib.crc32(scenario.encode())])
-    scene = Scene([*layout.objects, *cast(layout, rng, duration_s)], layout.lighting)
+    scene = Scene([*layout.objects, *found.cast(layout, rng, duration_s)], layout.lighting)
     position = np.array([1.0, layout.size[1] / 2, 1.4])
-    path = camera_path(motion, rng, position, np.array([*layout.table_centre, 0.85]))
+    path = camera_path(found.motion, rng, position, np.array([*layout.table_centre, 0.85]))
     return World(scene, path)

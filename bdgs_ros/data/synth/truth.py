@@ -43,6 +43,7 @@ from numpy.typing import NDArray
 from bdgs_ros.core import se3
 from bdgs_ros.core.errors import DatasetError
 from bdgs_ros.core.types import StampedPose, Trajectory
+from bdgs_ros.data.camera_file import CAMERA_FILE, read_camera_file
 from bdgs_ros.data.synth.sensor import DEPTH_SCALE
 
 _TOLERANCE_NS = 500_000  # stamps that went through a float come back this near
@@ -94,6 +95,8 @@ class SynthTruth:
                 f"'{folder}' has no 'truth/objects.json'; only recordings made by "
                 '`bdgs synth` carry the truth'
             )
+        scale = read_camera_file(Path(folder) / CAMERA_FILE).depth_scale
+        self._depth_scale = scale or DEPTH_SCALE
         self._exposure = self._read_exposure()
         self._stamps = np.array(sorted(self._exposure), dtype=np.int64)
 
@@ -128,7 +131,7 @@ class SynthTruth:
     def static_depth(self, stamp_ns: int) -> NDArray[np.float32]:
         """Return the depth of the static world, metres float32 (H, W)."""
         units = self._image('static_depth', stamp_ns)
-        return np.asarray(units.astype(np.float32) / np.float32(DEPTH_SCALE))
+        return np.asarray(units.astype(np.float32) / np.float32(self._depth_scale))
 
     def exposure(self, stamp_ns: int) -> float:
         """Return the exposure gain of a frame relative to the first."""

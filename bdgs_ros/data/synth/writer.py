@@ -23,7 +23,7 @@ from bdgs_ros.core.threads import one_thread_in_cv2
 from bdgs_ros.data.synth.lists import write_lists, write_objects
 from bdgs_ros.data.synth.plan import RecordingPlan
 from bdgs_ros.data.synth.render import FrameImages, FrameRenderer
-from bdgs_ros.data.synth.scenarios import World
+from bdgs_ros.data.synth.scenarios import World, find_scenario
 from bdgs_ros.data.synth.sensor import (
     DEPTH_SCALE,
     ColorSensor,
@@ -161,7 +161,7 @@ def write_recording(
     frames: int = 300,
     *,
     size: tuple[int, int] = (640, 480),
-    rate_hz: float = 30.0,
+    rate_hz: float | None = None,
     jobs: int | None = None,
     force: bool = False,
     progress: Progress | None = None,
@@ -174,13 +174,13 @@ def write_recording(
     folder : Path
         Where it goes; it appears there when it is complete and not before.
     scenario : str
-        One of `scenarios()`.
+        One of `scenarios()` or `field_scenarios()`.
     seed, frames : int
         Seed of everything that varies, and length.
     size : (int, int)
         Width and height in pixels; the field of view stays that of TUM freiburg3.
-    rate_hz : float
-        Frames per second.
+    rate_hz : float, optional
+        Frames per second; by default those of the scenario.
     jobs : int, optional
         Processes that share the work, by default one for each processor.
     force : bool
@@ -194,6 +194,7 @@ def write_recording(
         If the plan is impossible, or the folder holds something that may not be replaced.
 
     """
+    rate_hz = find_scenario(scenario).rate_hz if rate_hz is None else rate_hz
     plan = RecordingPlan(scenario, seed, frames, size[0], size[1], rate_hz)
     plan.validate()
     folder = Path(folder)
