@@ -112,6 +112,8 @@ class Cells:
     gaps: NDArray[np.float64]
     """Of them those where the image shows another surface."""
     columns: int
+    plane: NDArray[np.float64]
+    """Shape (C, 3): inverse depth of the image and its slope along u and v, per square; mean."""
 
 
 class Aligner:
@@ -337,7 +339,7 @@ class Aligner:
             CELL,
             self._params,
         )
-        return Cells(**raw)
+        return Cells(**raw, plane=_planes(current.handle.level(target)))
 
     def _result(self, raw: dict[str, Any], reference: ImagePyramid, level: int) -> AlignResult:
         finest = reference.handle.level(level)
@@ -448,6 +450,21 @@ def _levels(width: int, config: AlignConfig) -> tuple[int, int]:
     while finest >> count >= 0.7 * config.coarse_width:
         count += 1
     return block, count
+
+
+def _planes(level: Any) -> NDArray[np.float64]:
+    """Return inverse depth and its slopes of each square, 0 where none of it is one surface."""
+    rows, columns = -(-level.height // CELL), -(-level.width // CELL)
+    padding = ((0, rows * CELL - level.height), (0, columns * CELL - level.width))
+    squares = np.stack(
+        [
+            np.pad(plane, padding).reshape(rows, CELL, columns, CELL).swapaxes(1, 2)
+            for plane in (level.smooth, level.dx * CELL, level.dy * CELL)
+        ],
+        axis=-1,
+    ).reshape(rows * columns, CELL * CELL, 3)
+    count = (squares[..., 0] > 0).sum(axis=1, keepdims=True)
+    return np.asarray(squares.sum(axis=1) / np.maximum(count, 1), np.float64)
 
 
 def _median_depth(level: Any) -> float:

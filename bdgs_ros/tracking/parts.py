@@ -16,6 +16,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from bdgs_ros.core.config.tracking import PartsConfig
 from bdgs_ros.core.types import ProbabilityImage
@@ -26,6 +28,8 @@ Array = NDArray[np.float64]
 _FEWEST = 6  # points of a square that is asked
 _LIKELY, _ROUNDS = 4, 3  # motions that are refined, and how often
 _LOOSE = np.diag([0.1**-2] * 3 + [0.1**-2] * 3)  # m and rad: a proposal stays in the linear range
+_BEND = 0.02  # of inverse depth, from square to square, that a plane may have
+_LEFT = 0.25  # of the surface has to remain
 _LEAST_NOISE = 0.3  # residuals over those of the sensor
 
 
@@ -98,7 +102,53 @@ def find_world(
         step, is_other = likely[np.argmin(losses)], True
     excess = (_cost(cells, step[None])[0] - least) / scale
     moved = asked & (excess > config.moved)
+    moved = _whole_surfaces(moved, asked, cells, area, config)
     return Parts(step, moved.reshape(-1, cells.columns), cells, is_other)
+
+
+def _whole_surfaces(
+    moved: NDArray[np.bool_],
+    asked: NDArray[np.bool_],
+    cells: Cells,
+    area: Array,
+    config: PartsConfig,
+) -> NDArray[np.bool_]:
+    """
+    Where much of a plane moves, all of it does: a door hardly moves near its hinges.
+
+    Not where too little would be left to see by.
+    """
+    labels = _surfaces(cells)
+    size = np.bincount(labels, weights=asked)
+    share = np.bincount(labels, weights=moved) / np.maximum(size, 1)
+    whole = (share > config.surface) & (size >= config.least)
+    grown = moved | (asked & whole[labels])
+    return grown if area[~grown].sum() > _LEFT else moved
+
+
+def _surfaces(cells: Cells) -> NDArray[np.intp]:
+    """Return which plane each square belongs to: neighbours whose planes go on in each other."""
+    plane = cells.plane.reshape(-1, cells.columns, 3)
+    index = np.arange(len(cells.plane)).reshape(plane.shape[:2])
+    pairs = [
+        _joined(plane[:, :-1], plane[:, 1:], index[:, :-1], index[:, 1:], 1),
+        _joined(plane[:-1], plane[1:], index[:-1], index[1:], 2),
+    ]
+    first, second = np.hstack(pairs)
+    count = len(cells.plane)
+    graph = coo_array((np.ones(len(first)), (first, second)), shape=(count, count))
+    return np.asarray(connected_components(graph, directed=False)[1], np.intp)
+
+
+def _joined(
+    a: Array, b: Array, index_a: NDArray[np.intp], index_b: NDArray[np.intp], axis: int
+) -> NDArray[np.intp]:
+    """Return the pairs of neighbours along an axis that are on one plane, shape (2, P)."""
+    limit = _BEND * np.maximum(a[..., 0], b[..., 0])
+    gap = np.abs(b[..., 0] - a[..., 0] - 0.5 * (a[..., axis] + b[..., axis]))
+    turn = np.abs(b[..., 1:] - a[..., 1:]).max(axis=-1)
+    one = (a[..., 0] > 0) & (b[..., 0] > 0) & (gap < limit) & (turn < limit)
+    return np.stack([index_a[one], index_b[one]])
 
 
 def _noise(cells: Cells, asked: NDArray[np.bool_], least: Array) -> float:

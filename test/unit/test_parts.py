@@ -32,6 +32,7 @@ def cells(near: np.ndarray, near_step: np.ndarray, far_step: np.ndarray, seed: i
         seen=np.full(count, 16.0),
         gaps=np.zeros(count),
         columns=COLUMNS,
+        plane=np.zeros((count, 3)),
     )
 
 
@@ -76,6 +77,21 @@ def test_of_two_equals_the_expected_motion_is_the_world() -> None:
     even = Cells(**{**even.__dict__, 'depth_m': np.ones(ROWS * COLUMNS)})
     assert not world(even, RESTING, SURE).is_other
     assert world(even, STEP, SURE).is_other
+
+
+def test_a_door_moves_as_a_whole_though_its_hinges_do_not() -> None:
+    """A plane whose left two thirds were seen to move, before others that go on behind it."""
+    door = left(0.6)
+    seen = cells(left(0.4), STEP, RESTING)
+    plane = np.zeros((ROWS, COLUMNS, 3))
+    plane[..., 0] = np.where(door, 0.8 + 0.01 * np.arange(COLUMNS), 0.25)
+    plane[..., 1] = np.where(door, 0.01, 0.0)
+    whole = Cells(**{**seen.__dict__, 'plane': plane.reshape(-1, 3)})
+    assert (world(whole, RESTING, UNSURE).moved == door).mean() > 0.97
+    assert (world(seen, RESTING, UNSURE).moved == left(0.4)).mean() > 0.97
+    everywhere = np.tile([0.5, 0.0, 0.0], (ROWS * COLUMNS, 1))  # one plane: nothing would be left
+    plain = Cells(**{**cells(left(0.6), STEP, RESTING).__dict__, 'plane': everywhere})
+    assert world(plain, RESTING, UNSURE).moved.mean() < 0.7
 
 
 def test_too_little_tells_nothing() -> None:

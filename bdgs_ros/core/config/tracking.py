@@ -133,6 +133,9 @@ class PartsConfig:
     surprise: float = param(8.0, 'most that an unexpected motion counts against a part', low=0.0)
     margin: float = param(0.5, 'another part is so much more likely the world', low=0.0)
     moved: float = param(1.5, 'a square moves on its own: residuals beyond its noise', low=0.0)
+    surface: float = param(
+        0.4, 'a plane moves as a whole if this share of it does', low=0.0, high=1.0
+    )
     least: int = param(6, 'squares with depth; fewer tell nothing', low=1, high=1000)
 
 
