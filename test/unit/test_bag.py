@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from data_recordings import (
+    CAMERA_YAML,
     HEIGHT,
     START,
     WIDTH,
@@ -93,6 +94,25 @@ def test_frames_equal_those_of_the_folder(tmp_path: Path, storage: str, compress
         np.testing.assert_array_equal(got[index].depth_m, other.depth_m)
     assert got.ground_truth is not None and wanted.ground_truth is not None
     np.testing.assert_allclose(got.ground_truth.matrices, wanted.ground_truth.matrices, atol=1e-12)
+
+
+def test_depth_counts_as_the_camera_file_says(tmp_path: Path) -> None:
+    """A camera that counts 0.1 mm: its file says so, and the bag cannot."""
+    folder = write_tum(tmp_path / 'walk')
+    convert(folder, tmp_path / 'bag', ConvertOptions(depth_encoding='16UC1'))
+    usual = open_sequence(tmp_path / 'bag')[0].depth_m
+    for line, times in (('', 1.0), ('  depth_scale: 10000', 0.1)):
+        kept = [row for row in CAMERA_YAML.splitlines() if 'depth_scale' not in row]
+        camera = tmp_path / 'camera.yaml'
+        camera.write_text('\n'.join([*kept, line]) + '\n')
+        found = open_sequence(tmp_path / 'bag', camera)[0].depth_m
+        np.testing.assert_allclose(found, times * usual, rtol=1e-6)
+
+
+def test_the_largest_count_is_no_depth() -> None:
+    counts = np.array([[0, 1500], [65534, 65535]], np.uint16)
+    decoded = messages.depth_from_message(image_message(counts, '16UC1'), '/d')
+    np.testing.assert_allclose(decoded, [[0, 1.5], [65.534, 0]], rtol=1e-6)
 
 
 def test_a_single_storage_file_opens_too(bag: Path) -> None:
