@@ -106,8 +106,8 @@ class BagRecording:
         The open bag; the recording keeps it open.
     camera : PinholeCamera, optional
         Use this camera instead of the one in the bag.
-    depth_scale : float
-        Units of 16-bit depth in a metre.
+    depth_scale : float, optional
+        Units of 16-bit depth in a metre; by default millimetres.
     layout : TopicLayout, optional
         The names of the topics; recognised by default.
 

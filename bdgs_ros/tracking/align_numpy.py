@@ -355,13 +355,18 @@ def _normalised(rows: Linearised, scales: Scales, params: Params) -> tuple[Array
     return var_I, var_D, rows.grey**2 / var_I + rows.depth**2 / var_D
 
 
+def _robust(rows: Linearised, squared: Array, same: NDArray[np.bool_], params: Params) -> Array:
+    """Return the weights of the t-distribution, 0 where another surface is seen."""
+    return np.asarray(same * (params.dof + 1 + rows.has_depth) / (params.dof + squared))
+
+
 def _totals(
     points: Points, share: float, rows: Linearised, scales: Scales, params: Params
 ) -> dict[str, Any]:
     """Sum the weighted normal equations and count pixels; each point stands for `share`."""
     var_I, var_D, squared = _normalised(rows, scales, params)
     same = _same_surface(rows, scales)
-    weight = rows.p_static * same * (params.dof + 1 + rows.has_depth) / (params.dof + squared)
+    weight = rows.p_static * _robust(rows, squared, same, params)
     w_I, w_D = weight / var_I, weight * rows.has_depth * params.depth_weight / var_D
     information: Array = rows.J_I.T @ (w_I[:, None] * rows.J_I)
     information += rows.J_D.T @ (w_D[:, None] * rows.J_D)
@@ -473,7 +478,7 @@ def cells(
     scales = Scales(params.intensity_noise, params.depth_noise)
     var_I, var_D, squared = _normalised(rows, scales, params)
     same = _same_surface(rows, scales)
-    weight = rows.seen * same * (params.dof + 1 + rows.has_depth) / (params.dof + squared)
+    weight = rows.seen * _robust(rows, squared, same, params)
     J_I = rows.J_I[:, :6] * np.sqrt(weight / var_I)[:, None]
     J_D = rows.J_D[:, :6] * np.sqrt(weight * rows.has_depth / var_D)[:, None]
     e_I, e_D = rows.grey * np.sqrt(weight / var_I), rows.depth * np.sqrt(weight / var_D)

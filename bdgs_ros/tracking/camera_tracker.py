@@ -338,9 +338,12 @@ class CameraTracker:
         """Align coarse to fine, see what moves, refine against the rendered static map."""
         first = self._align(start.reference, current, start.T_world_camera, start.information)
         parts, coarse = self._find_world(start, current, first), first
-        if parts is not None and (parts.is_other or parts.moved.mean() > _LEAST_MOVED):
-            coarse, current = self._align_world(start, current, prior, first, parts)
-        p_dynamic = self._see_movers(prior, current, coarse, parts)
+        if parts is not None:
+            moved = parts.mask(prior.shape, self._config.movers.p_dynamic)
+            prior = np.maximum(prior, moved)
+            if parts.is_other or parts.moved.mean() > _LEAST_MOVED:
+                coarse, current = self._align_world(start, current, prior, first, parts)
+        p_dynamic = self._see_movers(prior, current, coarse)
         current = self._aligner.with_dynamic(current, p_dynamic, self._sweep(stamp_ns, coarse))
         fine = self._refine(current, coarse, start.information)
         spread = self._relative_covariance(parts, first, coarse, fine)
@@ -410,8 +413,7 @@ class CameraTracker:
         parts: Parts,
     ) -> tuple[Estimate, ImagePyramid]:
         """Align once more, without what moves against the world."""
-        moved = parts.mask(prior.shape, self._config.movers.p_dynamic)
-        still = self._aligner.with_dynamic(current, np.maximum(prior, moved))
+        still = self._aligner.with_dynamic(current, prior)
         T_current_reference = se3.exp(parts.step) @ coarse.quality.T_current_reference
         guess = start.reference.T_world_camera @ se3.inverse(T_current_reference)
         found = self._align(start.reference, still, guess, start.information, start.T_world_camera)
@@ -422,17 +424,13 @@ class CameraTracker:
         prior: ProbabilityImage,
         current: ImagePyramid,
         coarse: Estimate,
-        parts: Parts | None,
     ) -> ProbabilityImage:
-        """Join the prior with what moves on its own or stands nearer than the static map."""
-        seen = prior
-        if parts is not None:
-            seen = np.maximum(seen, parts.mask(prior.shape, self._config.movers.p_dynamic))
+        """Join the prior with what stands nearer than the static map (class-agnostic prior)."""
         if self._model is None or not self._config.masked:
-            return seen
+            return prior
         T_current_model = se3.inverse(coarse.T_world_camera) @ self._model.T_world_camera
         maps = self._aligner.residual_maps(self._model.pyramid, current, T_current_model)
-        return np.maximum(seen, self._movers.update(maps, prior.shape))
+        return np.maximum(prior, self._movers.update(maps, prior.shape))
 
     def _refine(
         self, current: ImagePyramid, coarse: Estimate, information: NDArray[np.float64]
@@ -468,7 +466,7 @@ class CameraTracker:
             self._become_keyframe(
                 frame, estimate.T_world_camera, attempt.current, attempt.p_dynamic, spread
             )
-        return replace(_result(frame, attempt, TrackingStatus.OK, is_keyframe), covariance=spread)
+        return _result(frame, attempt, TrackingStatus.OK, is_keyframe, spread)
 
     def _is_expected(self, frame: RgbdFrame, attempt: Attempt) -> bool:
         """Tell whether the camera was lost just now, and is where it was about to go."""
@@ -506,7 +504,8 @@ class CameraTracker:
         """Report loss; what was seen from a wrong pose says nothing about the next frame."""
         self._is_lost = True
         self._movers.reset()
-        return _result(frame, attempt, TrackingStatus.LOST, False)
+        nowhere = np.asarray(np.linalg.inv(attempt.start.information))
+        return _result(frame, attempt, TrackingStatus.LOST, False, nowhere)
 
     def _needs_keyframe(self, attempt: Attempt) -> bool:
         assert self._keyframe is not None
@@ -539,7 +538,11 @@ class CameraTracker:
 
 
 def _result(
-    frame: RgbdFrame, attempt: Attempt, status: TrackingStatus, is_keyframe: bool
+    frame: RgbdFrame,
+    attempt: Attempt,
+    status: TrackingStatus,
+    is_keyframe: bool,
+    spread: NDArray[np.float64],
 ) -> TrackingResult:
     """Return what came of a frame; a lost one has no pose but where it was looked for."""
     found, start = attempt.best, attempt.start
@@ -548,7 +551,7 @@ def _result(
         frame.stamp_ns,
         status,
         found.T_world_camera if is_ok else start.T_world_camera,
-        found.quality.covariance if is_ok else np.asarray(np.linalg.inv(start.information)),
+        spread,
         is_keyframe,
         attempt.p_dynamic,
         found.quality.inlier_ratio,

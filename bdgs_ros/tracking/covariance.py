@@ -23,11 +23,9 @@ from bdgs_ros.core import se3
 from bdgs_ros.core.config.tracking import CovarianceConfig
 from bdgs_ros.core.types import Pose
 from bdgs_ros.tracking.align import Cells
-from bdgs_ros.tracking.parts import blocks_of_two
+from bdgs_ros.tracking.parts import FEWEST, blocks_of_two
 
 Array = NDArray[np.float64]
-
-_FEWEST = 6  # points of a square that counts
 
 
 def of_alignment(
@@ -62,7 +60,7 @@ def of_alignment(
         Of the camera's tangent, m^2 and rad^2.
 
     """
-    used = (cells.seen >= _FEWEST) & ~moved.reshape(-1)
+    used = (cells.seen >= FEWEST) & ~moved.reshape(-1)
     pulls = (cells.gradient + cells.information @ step) * used[:, None]
     information = cells.information[used].sum(axis=0)
     information += 1e-6 * np.trace(information) * np.eye(6) + 1e-6 * np.eye(6)

@@ -25,7 +25,7 @@ from bdgs_ros.tracking.align import Cells
 
 Array = NDArray[np.float64]
 
-_FEWEST = 6  # points of a square that is asked
+FEWEST = 6  # points of a square that is asked
 _LIKELY, _ROUNDS = 4, 3  # motions that are refined, and how often
 _LOOSE = np.diag([0.1**-2] * 3 + [0.1**-2] * 3)  # m and rad: a proposal stays in the linear range
 _BEND = 0.02  # of inverse depth, from square to square, that a plane may have
@@ -76,7 +76,7 @@ def find_world(
         None where too little is seen to tell.
 
     """
-    asked = (cells.seen >= _FEWEST) & (cells.weight > 0)
+    asked = (cells.seen >= FEWEST) & (cells.weight > 0)
     if asked.sum() < config.least:
         return None
     motions = np.vstack([np.zeros((1, 6)), expected[None], _proposals(cells, asked)])
