@@ -28,6 +28,7 @@ from bdgs_ros.detection.stage import DetectionStage
 from bdgs_ros.mapping.entrance import check_entrance, entrance
 from bdgs_ros.mapping.mapper import Mapper
 from bdgs_ros.tracking.camera_tracker import CameraTracker
+from bdgs_ros.tracking.piece import Explorer, Piece
 from bdgs_ros.tracking.shutter import straightened
 
 
@@ -37,6 +38,8 @@ class FrameResult:
 
     labels: Labels
     tracking: TrackingResult
+    gave_up: bool = False
+    """All poses before this frame are in a world that is no more."""
 
 
 class BdgsSlam:
@@ -57,6 +60,7 @@ class BdgsSlam:
     ) -> None:
         self.detection = DetectionStage(config.detection, detector)
         self.tracker = CameraTracker(config.tracking)
+        self.explorer = Explorer(config.tracking)
         self.mapper = Mapper(config.mapping, config.belief)
         self.back_end = BackEnd(config.back_end)
         self._width, self._map_width = config.camera.width, config.mapping.width
@@ -99,6 +103,7 @@ class BdgsSlam:
         view = entrance(self.mapper, start, camera.rectified(), self._map_width)
         check_entrance(view, map_file)
         self.tracker.start_from(view, self.mapper.photographs())
+        self.explorer.reset(is_known=True)
 
     def process(self, frame: RgbdFrame) -> FrameResult:
         """Take the next frame: who moves, where is the camera, what does the world look like."""
@@ -110,19 +115,36 @@ class BdgsSlam:
         fitting = fitted(labels, frame)
         tracking = self.tracker.process(frame, fitting)
         self.tracker.rest()
+        piece = self.explorer.follow(frame, fitting, tracking)
+        if piece is not None:
+            self._take_piece(piece)
         if tracking.status is TrackingStatus.OK:
             self.back_end.observe(frame.stamp_ns, tracking.T_world_camera)
         if tracking.is_keyframe:
             keyframe = Keyframe(frame, tracking.T_world_camera, fitting.p_dynamic)
             self.tracker.set_model(take_keyframe(self.back_end, self.mapper, keyframe))
             self.tracker.note_keyframes(self.mapper.keyframe_poses())
-        return FrameResult(labels, tracking)
+        return FrameResult(labels, tracking, piece is not None and piece.is_new_world)
+
+    def _take_piece(self, piece: Piece) -> None:
+        """Make a piece of map that was seen while the camera was lost a part of the world."""
+        if piece.is_new_world:
+            self.back_end.reset()
+            self.mapper.reset()
+            self.tracker.start_from(piece.entrance())
+        self.tracker.learn(piece.keyframes, piece.covariances)
+        self.mapper.history.join(piece.poses)
+        if not self.mapper.frozen:
+            for keyframe in piece.keyframes:
+                take_keyframe(self.back_end, self.mapper, keyframe)
+            self.tracker.note_keyframes(self.mapper.keyframe_poses())
 
     def reset(self) -> None:
         """Forget everything."""
         self.back_end.reset()
         self.detection.reset()
         self.tracker.reset()
+        self.explorer.reset()
         self.mapper.reset()
 
 

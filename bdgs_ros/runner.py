@@ -36,6 +36,10 @@ class Outcome(Protocol):
     def tracking(self) -> TrackingResult:
         """The camera pose."""
 
+    @property
+    def gave_up(self) -> bool:
+        """Whether all poses before this frame are in a world that is no more."""
+
 
 class Slam(Protocol):
     """What can be run; see `bdgs_ros.pipeline.BdgsSlam`."""
@@ -134,6 +138,8 @@ def run_sequence(
             start = time.perf_counter()
             outcome = slam.process(frame)
             times_ms['frame'] = 1e3 * (time.perf_counter() - start)
+            if outcome.gave_up:
+                recorder.give_up()
             recorder.add(frame, outcome.tracking, times_ms)
             watching = time.perf_counter()
             for observe in observers:

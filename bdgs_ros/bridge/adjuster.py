@@ -16,7 +16,7 @@ from dataclasses import replace
 from bdgs_ros.back_end.back_end import BackEnd
 from bdgs_ros.core import se3
 from bdgs_ros.core.types import Keyframe, ModelView, Pose, StampedPose
-from bdgs_ros.mapping.history import Move, moved_between
+from bdgs_ros.mapping.history import Move, moved_between, seen_from
 from bdgs_ros.mapping.mapper import Mapper
 from bdgs_ros.pipeline import Adjustment, adjust
 
@@ -135,6 +135,11 @@ class Adjuster:
         with self._lock:
             if self._at_once:
                 self._moves = [*self._moves, (stamp_ns, T_new_old)]
+
+    def note_piece(self, first_ns: int, last_ns: int) -> None:
+        """Take the time during which a piece of map was made that is part of the world now."""
+        with self._lock:
+            self._moves = seen_from(self._moves, first_ns, last_ns)
 
     def _placement(self, keyframe: Keyframe, poses: dict[int, Pose]) -> Pose | None:
         """

@@ -13,9 +13,11 @@ from bdgs_ros.bridge.node_config import TrackingNodeConfig
 from bdgs_ros.bridge.optional import TransformPublisher
 from bdgs_ros.core import se3
 from bdgs_ros.core.types import Pose, StampedPose, TrackingResult, Trajectory
+from bdgs_ros.tracking.piece import Piece
 
 _PATH_POSES = 2000
 _POLL_S = 0.02
+_NOWHERE = 'piece'  # a frame that nobody knows the place of
 
 
 class PoseOutput:
@@ -39,6 +41,10 @@ class PoseOutput:
         self._odometry = node.create_publisher(Odometry, topics.ODOMETRY, topics.RELIABLE)
         self._path = node.create_publisher(Path, topics.PATH, topics.LATCHED)
         self._keyframe = node.create_publisher(PoseStamped, topics.KEYFRAME, topics.RELIABLE)
+        self._piece = node.create_publisher(Path, topics.PIECE, topics.RELIABLE)
+        self._piece_keyframe = node.create_publisher(
+            PoseStamped, topics.PIECE_KEYFRAME, topics.RELIABLE
+        )
         self._move = node.create_publisher(PoseStamped, topics.MOVE, topics.RELIABLE)
         self._transform = TransformPublisher(node, config.publish_tf)
 
@@ -54,6 +60,15 @@ class PoseOutput:
     def publish_move(self, stamp_ns: int, T_new_old: Pose) -> None:
         """Say that the poses from a frame on are in a world that has moved."""
         self._move.publish(conversions.motion_stamped(T_new_old, stamp_ns, self._config.map_frame))
+
+    def publish_piece_keyframe(self, stamp_ns: int) -> None:
+        """Have the images of a frame kept: the camera is lost, and it is a keyframe of a piece."""
+        self._piece_keyframe.publish(conversions.pose_stamped(se3.identity(), stamp_ns, _NOWHERE))
+
+    def publish_piece(self, piece: Piece) -> None:
+        """Say where the camera was while it was lost."""
+        frame = self._config.map_frame
+        self._piece.publish(conversions.path_message(piece.poses, piece.poses[-1].stamp_ns, frame))
 
     def wait_for_mapping(self, patience_s: float) -> None:
         """Wait until somebody listens to keyframes: discovery may be under way."""

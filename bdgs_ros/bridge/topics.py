@@ -23,6 +23,10 @@ SHED = 'bdgs/shed'
 """What is to be left out so that tracking keeps up, see `bridge.governor`."""
 MOVE = 'bdgs/move'
 """By what tracking moved the present before a frame: it learnt where its keyframes are."""
+PIECE = 'bdgs/piece'
+"""The poses of frames that were seen while the camera was lost, once it is known where."""
+PIECE_KEYFRAME = 'bdgs/piece/keyframe'
+"""Which of them mapping shall keep the images of; the pose is in the piece."""
 MODEL_IMAGE = 'bdgs/model/image'
 MODEL_DEPTH = 'bdgs/model/depth'
 MODEL_DYNAMIC = 'bdgs/model/dynamic'

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,6 +129,13 @@ class Recorder:
                 tracking.covariance.copy(),
             )
         )
+
+    def give_up(self) -> None:
+        """Count all frames so far as lost: the world that they were in is no more."""
+        lost = TrackingStatus.LOST
+        self.rows = [replace(row, status=lost, is_keyframe=False) for row in self.rows]
+        nowhere = np.full((4, 4), np.nan)
+        self.samples = [replace(sample, T_world_camera=nowhere) for sample in self.samples]
 
     def _sample(self, frame: RgbdFrame, tracking: TrackingResult) -> None:
         pose = tracking.T_world_camera.copy()

@@ -12,7 +12,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from operator import itemgetter
+from operator import attrgetter, itemgetter
 from typing import Any
 
 import numpy as np
@@ -50,6 +50,15 @@ def moved_between(moves: Sequence[Move], earlier_ns: int, later_ns: int) -> Pose
     return moved
 
 
+def seen_from(moves: Sequence[Move], first_ns: int, last_ns: int) -> list[Move]:
+    """
+    Return the moves as they are for a piece of map that came into the world as a whole.
+
+    What moved while the piece was made, from its first frame to its last, had moved before it.
+    """
+    return [(first_ns if first_ns < s <= last_ns else s, T_new_old) for s, T_new_old in moves]
+
+
 class History:
     """All keyframes that ever were, also those whose images are forgotten."""
 
@@ -57,6 +66,7 @@ class History:
         self._anchors: dict[int, Anchor] = {}
         self._earlier_ns: list[int] = []
         self._moves: list[Move] = []
+        self._joined: list[StampedPose] = []
 
     @property
     def stamps_ns(self) -> list[int]:
@@ -66,7 +76,7 @@ class History:
     def begin_run(self) -> None:
         """Keep of earlier runs nothing but the stamps: their poses correct no new frame."""
         self._earlier_ns, self._anchors = self.stamps_ns, {}
-        self._moves = []
+        self._moves, self._joined = [], []
 
     @property
     def poses(self) -> dict[int, Pose]:
@@ -90,6 +100,18 @@ class History:
     def note_move(self, stamp_ns: int, T_new_old: Pose) -> None:
         """Note that tracking moved everything before a frame: it learnt where keyframes are."""
         self._moves.append((stamp_ns, T_new_old))
+
+    def join(self, poses: Sequence[StampedPose]) -> None:
+        """Take the frames of a piece of map that was placed in the world after it was made."""
+        if poses:
+            self._joined += poses
+            self._moves = seen_from(self._moves, poses[0].stamp_ns, poses[-1].stamp_ns)
+
+    def completed(self, online: Trajectory) -> Trajectory:
+        """Return the trajectory with the frames of such pieces, uncorrected."""
+        known = {pose.stamp_ns for pose in online.poses}
+        more = [pose for pose in self._joined if pose.stamp_ns not in known]
+        return Trajectory(tuple(sorted((*online.poses, *more), key=attrgetter('stamp_ns'))))
 
     def refresh(self, keyframes: Iterable[MapKeyframe]) -> None:
         """Take over the present poses and exposures."""
@@ -174,7 +196,16 @@ class History:
             {'stamp_ns': stamp_ns, 'T_new_old': T_new_old.tolist()}
             for stamp_ns, T_new_old in self._moves
         ]
-        return {'anchors': anchors, 'moves': moves, 'earlier_ns': self._earlier_ns}
+        joined = [
+            {'stamp_ns': pose.stamp_ns, 'T_world_camera': pose.T_world_camera.tolist()}
+            for pose in self._joined
+        ]
+        return {
+            'anchors': anchors,
+            'moves': moves,
+            'joined': joined,
+            'earlier_ns': self._earlier_ns,
+        }
 
     @classmethod
     def from_document(cls, document: dict[str, Any]) -> History:
@@ -188,4 +219,7 @@ class History:
         for entry in document['moves']:
             T_new_old = np.array(entry['T_new_old'], float).reshape(4, 4)
             history.note_move(int(entry['stamp_ns']), T_new_old)
+        for entry in document.get('joined', []):  # older maps have none
+            pose = np.array(entry['T_world_camera'], float).reshape(4, 4)
+            history._joined.append(StampedPose(int(entry['stamp_ns']), pose))
         return history

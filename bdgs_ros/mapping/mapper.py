@@ -444,14 +444,19 @@ class Mapper:
         )
 
     def final_trajectory(self, online: Trajectory) -> Trajectory:
-        """Return poses with what mapping found out after it had answered tracking."""
+        """
+        Return poses with what mapping found out after it had answered tracking.
+
+        Frames of pieces of map that were joined later have one, too.
+        """
         self.history.refresh(self.keyframes)
-        return self.history.correct(online)
+        return self.history.correct(self.history.completed(online))
 
     def final_pose(self, stamp_ns: int, T_world_camera: Pose) -> Pose:
-        """Return one pose of `final_trajectory`."""
+        """Return one pose with what mapping found out later."""
         online = Trajectory((StampedPose(stamp_ns, T_world_camera),))
-        return self.final_trajectory(online).poses[0].T_world_camera
+        self.history.refresh(self.keyframes)
+        return self.history.correct(online).poses[0].T_world_camera
 
     def view(
         self,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -44,6 +44,7 @@ from bdgs_ros.core.types import (
 )
 from bdgs_ros.mapping.mapper import Mapper
 from bdgs_ros.nodes.map_entrance import MapEntrance
+from bdgs_ros.nodes.map_pieces import MapPieces
 from bdgs_ros.nodes.map_services import AT_RUN_TIME, LiveMap, MapServices
 from bdgs_ros.pipeline import Adjustment
 
@@ -120,6 +121,9 @@ class MappingNode(GraphNode):
             self, self._config, self._health, self._keep_frame, self._forget
         )
         self.create_subscription(Image, topics.LABELS, self._keep_labels, topics.KEPT, raw=True)
+        self._pieces = MapPieces(
+            self, self._assembling, self._adjusting.put, self._on_joined
+        )  # before keyframes: of what comes at once, a piece is older
         self.create_subscription(
             PoseStamped, topics.KEYFRAME, self._queue_keyframe, topics.RELIABLE
         )
@@ -170,24 +174,43 @@ class MappingNode(GraphNode):
 
     def _on_keyframe(self, message: PoseStamped, raw: RawFrame | None) -> None:
         """Have the back end look at a keyframe, then hand it over to the map."""
-        stamp_ns = conversions.stamp_ns(message)
-        try:
-            keyframe = self._assemble(message, raw or self._wait_frame(stamp_ns))
-        except BdgsError as error:
-            keyframe = None
-            self._health.error(error)
+        keyframe = self._made(message, raw)
+        for joined in self._pieces.take():
+            self._adjust(joined)
         if keyframe is None:
-            self._answer_nothing(stamp_ns)
-        elif not self._mapper.grows:
-            self._worker.put(partial(self._show_map, keyframe))
+            self._answer_nothing(conversions.stamp_ns(message))
         else:
-            with self._health.timed('back_end'):
-                adjustment = self._back_end.adjust(keyframe, self._tracked_until(stamp_ns))
-            self._tell_refusals()
-            if adjustment is not None:
-                self._worker.put(partial(self._map, keyframe, adjustment))
-            self._health.counts['keyframes_dropped'] = self._worker.dropped
-            self._health.counts['keyframes_passed_over'] = self._adjusting.dropped
+            self._adjust(keyframe)
+
+    def _made(self, message: PoseStamped, raw: RawFrame | None) -> Keyframe | None:
+        try:
+            return self._assemble(message, raw or self._wait_frame(conversions.stamp_ns(message)))
+        except BdgsError as error:
+            self._health.error(error)
+            return None
+
+    def _adjust(self, keyframe: Keyframe) -> None:
+        if not self._mapper.grows:
+            self._worker.put(partial(self._show_map, keyframe))
+            return
+        stamp_ns = keyframe.frame.stamp_ns
+        with self._health.timed('back_end'):
+            adjustment = self._back_end.adjust(keyframe, self._tracked_until(stamp_ns))
+        self._tell_refusals()
+        if adjustment is not None:
+            self._worker.put(partial(self._map, keyframe, adjustment))
+        self._health.counts['keyframes_dropped'] = self._worker.dropped
+        self._health.counts['keyframes_passed_over'] = self._adjusting.dropped
+
+    def _assembling(self, message: PoseStamped) -> Callable[[], Keyframe | None]:
+        """Return what makes a keyframe of a message; its images are taken along now."""
+        return partial(self._made, message, self._frames.get(conversions.stamp_ns(message)))
+
+    def _on_joined(self, poses: Sequence[StampedPose]) -> None:
+        """Take the frames of a piece of map into the world."""
+        if self._live.is_entered and poses:
+            self._mapper.history.join(poses)
+            self._back_end.note_piece(poses[0].stamp_ns, poses[-1].stamp_ns)
 
     def _tell_refusals(self) -> None:
         """Say that drift stays, as long as nothing that the back end finds can be believed."""

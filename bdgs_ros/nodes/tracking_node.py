@@ -28,10 +28,11 @@ from bdgs_ros.bridge.worker import Worker
 from bdgs_ros.core.errors import ConfigError, DatasetError, MapError
 from bdgs_ros.core.images import fitted, halved
 from bdgs_ros.core.threads import one_thread_in_cv2
-from bdgs_ros.core.types import Keyframe, RgbdFrame, TrackingResult, TrackingStatus
+from bdgs_ros.core.types import Keyframe, Labels, RgbdFrame, TrackingResult, TrackingStatus
 from bdgs_ros.data.trajectory_io import write_trajectory
 from bdgs_ros.mapping.map_files import load_places
 from bdgs_ros.tracking.camera_tracker import CameraTracker
+from bdgs_ros.tracking.piece import Explorer, Piece
 
 _MOST_WAITING = 30  # frames, however slow tracking is; it takes the newest of them
 _AT_RUN_TIME = ('map_file', 'trajectory_file')
@@ -51,6 +52,8 @@ class TrackingNode(GraphNode):
         self._keyframes = 0
         self._health = Health(self, 'tracking')
         self._tracker = CameraTracker(config.tracking)
+        self._explorer = Explorer(config.tracking)
+        self._joined: list[Piece] = []  # that mapping is to hear of
         self._output = PoseOutput(self, config)
         self._status = self.create_publisher(DiagnosticArray, topics.STATUS, topics.RELIABLE)
         self._reset_event = self.create_publisher(Empty, topics.RESET_EVENT, topics.RELIABLE)
@@ -120,6 +123,7 @@ class TrackingNode(GraphNode):
                 return False
             if view is not None:
                 self._tracker.start_from(view, self._places())
+                self._explorer.reset(is_known=True)
         self._has_begun = True
         return True
 
@@ -138,6 +142,7 @@ class TrackingNode(GraphNode):
         return places
 
     def _track(self, raw: RawFrame, frame: RgbdFrame) -> None:
+        self._tell_joined()
         labels = self._feedback.labels(frame)
         frame = halved(frame, self._config.camera.width)
         labels = labels and fitted(labels, frame)
@@ -149,6 +154,7 @@ class TrackingNode(GraphNode):
             self._output.publish_move(raw.stamp_ns, move)
         started = time.perf_counter()
         result = self._tracker.process(frame, labels, self._is_hurried())
+        self._explore(frame, labels, result)
         tracking_ms = (time.perf_counter() - started) * 1e3
         result = self._announced(result)
         if result.is_keyframe and self._config.lockstep and self._keyframes == 1:
@@ -161,6 +167,34 @@ class TrackingNode(GraphNode):
         if result.is_keyframe and self._config.lockstep:
             self._tracker.set_model(self._feedback.wait_model(result.stamp_ns))
         self._report(raw, result, tracking_ms, latency_ms)
+
+    def _explore(self, frame: RgbdFrame, labels: Labels | None, result: TrackingResult) -> None:
+        """Follow a camera that is lost, until it is known where it has been meanwhile."""
+        piece = self._explorer.follow(frame, labels, result)
+        self._health.counts['piece_s'] = round(self._explorer.length_s)
+        if self._explorer.keyframe_ns == frame.stamp_ns:
+            self._output.publish_piece_keyframe(frame.stamp_ns)
+        if piece is None:
+            return
+        self._joined.append(piece)
+        if piece.is_new_world:  # mapping shall forget first, and hear of the rest after that
+            self._give_up_for(piece)
+        else:
+            self._tell_joined()
+        self._tracker.learn(piece.keyframes, piece.covariances)
+
+    def _give_up_for(self, piece: Piece) -> None:
+        """Begin anew with a piece of map, all of which was seen since the camera was lost."""
+        self._feedback.forget_map()
+        self._feedback.clear()
+        self._output.clear()
+        self._reset_event.publish(Empty())
+        self._tracker.start_from(piece.entrance())
+
+    def _tell_joined(self) -> None:
+        for piece in self._joined:
+            self._output.publish_piece(piece)
+        self._joined = []
 
     def _announced(self, result: TrackingResult) -> TrackingResult:
         """Under the greatest load every other keyframe is one to tracking alone."""
@@ -215,6 +249,8 @@ class TrackingNode(GraphNode):
 
     def _start_over(self) -> None:
         self._tracker.reset()
+        self._explorer.reset()
+        self._joined = []
         self._has_begun = False
         self._feedback.clear()
         self._output.clear()

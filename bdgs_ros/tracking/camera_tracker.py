@@ -116,6 +116,24 @@ class CameraTracker:
         for keyframe in keyframes:
             self._places.add(keyframe.frame, keyframe.T_world_camera, keyframe.p_dynamic)
 
+    def learn(
+        self, keyframes: Iterable[Keyframe], covariances: Iterable[NDArray[np.float64]]
+    ) -> None:
+        """
+        Take keyframes that somebody else saw: places where the camera may be found.
+
+        Parameters
+        ----------
+        keyframes : iterable of Keyframe
+            In this world.
+        covariances : iterable of ndarray, shape (6, 6)
+            Of their poses.
+
+        """
+        for keyframe, spread in zip(keyframes, covariances, strict=True):
+            self._places.add(keyframe.frame, keyframe.T_world_camera, keyframe.p_dynamic)
+            self._doubt[keyframe.frame.stamp_ns] = spread
+
     def set_model(self, view: ModelView | None) -> None:
         """
         Take the static map as rendered at a keyframe, or None where there is no map.

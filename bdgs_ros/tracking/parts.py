@@ -12,23 +12,23 @@ like that.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from bdgs_ros.core.config.tracking import PartsConfig
 from bdgs_ros.core.types import ProbabilityImage
 from bdgs_ros.tracking.align import Cells
+from bdgs_ros.tracking.surfaces import planes, things
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 FEWEST = 6  # points of a square that is asked
 _LIKELY, _ROUNDS = 4, 3  # motions that are refined, and how often
 _LOOSE = np.diag([0.1**-2] * 3 + [0.1**-2] * 3)  # m and rad: a proposal stays in the linear range
-_BEND = 0.02  # of inverse depth, from square to square, that a plane may have
 _LEFT = 0.25  # of the surface has to remain
 _LEAST_NOISE = 0.3  # residuals over those of the sensor
 
@@ -39,7 +39,7 @@ class Parts:
 
     step: Array
     """Shape (6,): xi of the world, `exp(xi) @ T_current_reference`."""
-    moved: NDArray[np.bool_]
+    moved: Mask
     """Shape (rows, columns)."""
     cells: Cells
     is_other: bool
@@ -100,63 +100,63 @@ def find_world(
             likely = np.stack([_refined(cells, step, least, scale, asked) for step in likely])
         losses = loss(likely, _cost(cells, likely))
         step, is_other = likely[np.argmin(losses)], True
-    excess = (_cost(cells, step[None])[0] - least) / scale
-    moved = asked & (excess > config.moved)
-    moved = _whole_surfaces(moved, asked, cells, area, config)
+    moved = _what_moves(cells, asked, step, least, scale, area, config)
     return Parts(step, moved.reshape(-1, cells.columns), cells, is_other)
 
 
-def _whole_surfaces(
-    moved: NDArray[np.bool_],
-    asked: NDArray[np.bool_],
+def _what_moves(
     cells: Cells,
+    asked: Mask,
+    step: Array,
+    least: Array,
+    scale: Array,
     area: Array,
     config: PartsConfig,
-) -> NDArray[np.bool_]:
-    """
-    Where much of a plane moves, all of it does: a door hardly moves near its hinges.
+) -> Mask:
+    """Return the squares that are not the world, which moves by `step`."""
+    cost = _cost(cells, step[None])[0] / scale
+    moved: Mask = asked & ((cost - least / scale > config.moved) | (cost > config.unlike))
+    for whole in (_whole_planes, partial(_whole_things, cost=cost, scale=scale)):
+        grown = moved | (asked & whole(moved, cells, config))
+        if area[~grown].sum() > _LEFT:
+            moved = grown
+    return moved
 
-    Not where too little would be left to see by.
-    """
-    labels = _surfaces(cells)
-    size = np.bincount(labels, weights=asked)
+
+def _whole_planes(moved: Mask, cells: Cells, config: PartsConfig) -> Mask:
+    """Return planes of which much moves: all of them does, as a door near its hinges."""
+    labels = planes(cells)
+    size = np.bincount(labels, weights=cells.seen >= FEWEST)
     share = np.bincount(labels, weights=moved) / np.maximum(size, 1)
-    whole = (share > config.surface) & (size >= config.least)
-    grown = moved | (asked & whole[labels])
-    return grown if area[~grown].sum() > _LEFT else moved
+    return np.asarray(((share > config.surface) & (size >= config.least))[labels])
 
 
-def _surfaces(cells: Cells) -> NDArray[np.intp]:
-    """Return which plane each square belongs to: neighbours whose planes go on in each other."""
-    plane = cells.plane.reshape(-1, cells.columns, 3)
-    index = np.arange(len(cells.plane)).reshape(plane.shape[:2])
-    pairs = [
-        _joined(plane[:, :-1], plane[:, 1:], index[:, :-1], index[:, 1:], 1),
-        _joined(plane[:-1], plane[1:], index[:-1], index[1:], 2),
-    ]
-    first, second = np.hstack(pairs)
-    count = len(cells.plane)
-    graph = coo_array((np.ones(len(first)), (first, second)), shape=(count, count))
-    return np.asarray(connected_components(graph, directed=False)[1], np.intp)
+def _whole_things(
+    moved: Mask, cells: Cells, config: PartsConfig, *, cost: Array, scale: Array
+) -> Mask:
+    """
+    Return the plain parts of things that move: a shirt without a pattern agrees with any motion.
+
+    What agrees with the world's motion, and not as well with the thing's, stays the world.
+    """
+    labels = things(cells)
+    count = np.bincount(labels, weights=moved)
+    found = np.zeros_like(moved)
+    for label in np.flatnonzero(count >= config.least):
+        own = labels == label
+        motion = _agreed(cells, own & moved)
+        is_world = own & ~moved & (_cost(cells, motion[None])[0] / scale - cost > config.moved)
+        if count[label] > is_world.sum():
+            found |= own & ~is_world
+    return found
 
 
-def _joined(
-    a: Array, b: Array, index_a: NDArray[np.intp], index_b: NDArray[np.intp], axis: int
-) -> NDArray[np.intp]:
-    """Return the pairs of neighbours along an axis that are on one plane, shape (2, P)."""
-    limit = _BEND * np.maximum(a[..., 0], b[..., 0])
-    gap = np.abs(b[..., 0] - a[..., 0] - 0.5 * (a[..., axis] + b[..., axis]))
-    turn = np.abs(b[..., 1:] - a[..., 1:]).max(axis=-1)
-    one = (a[..., 0] > 0) & (b[..., 0] > 0) & (gap < limit) & (turn < limit)
-    return np.stack([index_a[one], index_b[one]])
-
-
-def _noise(cells: Cells, asked: NDArray[np.bool_], least: Array) -> float:
+def _noise(cells: Cells, asked: Mask, least: Array) -> float:
     """Return how large residuals are that some motion explains, over those of the sensor."""
     return max(float(np.median(least[asked] / cells.weight[asked])), _LEAST_NOISE)
 
 
-def _proposals(cells: Cells, asked: NDArray[np.bool_]) -> Array:
+def _proposals(cells: Cells, asked: Mask) -> Array:
     """Return the motions that neighbouring squares see together, shape (N, 6)."""
     squares = (cells.information * asked[:, None, None]).reshape(-1, cells.columns, 36)
     H = _windows(squares).reshape(-1, 6, 6)
@@ -185,10 +185,12 @@ def _cost(cells: Cells, motions: Array) -> Array:
     return np.asarray(np.maximum(cells.cost + linear + square, 0.0))
 
 
-def _refined(
-    cells: Cells, step: Array, least: Array, scale: Array, asked: NDArray[np.bool_]
-) -> Array:
+def _refined(cells: Cells, step: Array, least: Array, scale: Array, asked: Mask) -> Array:
     """Let the squares that agree with a motion decide on it."""
-    members = asked & ((_cost(cells, step[None])[0] - least) / scale < 1.0)
+    return _agreed(cells, asked & ((_cost(cells, step[None])[0] - least) / scale < 1.0))
+
+
+def _agreed(cells: Cells, members: Mask) -> Array:
+    """Return the motion that some squares have seen together, shape (6,)."""
     H = cells.information[members].sum(axis=0)
     return np.asarray(-np.linalg.solve(H + _LOOSE, cells.gradient[members].sum(axis=0)))

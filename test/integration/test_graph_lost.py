@@ -19,7 +19,8 @@ from bdgs_ros.core.types import StampedPose, TrackingStatus, Trajectory  # noqa:
 from bdgs_ros.data.bag_recording import BagSequence  # noqa: E402
 from bdgs_ros.data.convert import convert  # noqa: E402
 from bdgs_ros.data.synth.writer import write_recording  # noqa: E402
-from bdgs_ros.data.trajectory_io import read_trajectory  # noqa: E402
+from bdgs_ros.data.trajectory_io import read_trajectory, write_trajectory  # noqa: E402
+from bdgs_ros.mapping.history import History  # noqa: E402
 from bdgs_ros.pipeline import BdgsSlam  # noqa: E402
 
 FRAMES = 22
@@ -66,6 +67,57 @@ def test_a_covered_lens_in_the_graph(
     offline = without_ros(bag, settings)
     assert found.stamps_ns.tolist() == offline.stamps_ns.tolist()
     assert found.positions == pytest.approx(offline.positions, abs=1e-4)
+
+
+@pytest.fixture(scope='module')
+def carried_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Carry the camera away between two frames; from there it comes back by itself."""
+    folder = tmp_path_factory.mktemp('carried')
+    synth = folder / 'synth'
+    write_recording(synth, 'loop_room', 0, 96, size=(320, 240), jobs=1)
+    order = [*range(8), *range(95, 2, -3)]
+    truth = read_trajectory(synth / 'groundtruth.txt')
+    for kind in ('rgb', 'depth'):
+        rows = [line.split() for line in (synth / f'{kind}.txt').read_text().splitlines()]
+        rows = [row for row in rows if row[0] != '#']
+        seen = [f'{rows[i][0]} {rows[j][1]}' for i, j in enumerate(order)]
+        (synth / f'{kind}.txt').write_text('\n'.join(seen))
+    poses = [StampedPose(int(truth.stamps_ns[i]), truth.matrices[j]) for i, j in enumerate(order)]
+    write_trajectory(synth / 'groundtruth.txt', Trajectory(tuple(poses)))
+    convert(synth, folder / 'bag')
+    return folder / 'bag'
+
+
+@pytest.mark.parametrize('mode', ['lockstep', 'realtime'])
+def test_what_was_seen_while_lost_joins_the_world(
+    graph: Graph, carried_bag: Path, settings: dict[str, object], tmp_path: Path, mode: str
+) -> None:
+    out = tmp_path / 'out'
+    slam = graph.node(
+        'slam_node',
+        bag=carried_bag,
+        output=out,
+        exit_at_end=True,
+        mode=mode,
+        rate=0.3,
+        tracking__piece__patience_s=0.05,
+        **settings,
+    )
+    assert slam.wait(120.0) == 0, slam.text()
+    online, final = (
+        read_trajectory(out / name) for name in ('trajectory.txt', 'trajectory_final.txt')
+    )
+    assert len(online) < 30
+    assert len(final) >= 33, slam.text()
+    assert set(online.stamps_ns.tolist()) < set(final.stamps_ns.tolist())
+    assert 'a piece of map is joined' in slam.text()
+    metrics = json.loads((out / 'metrics.json').read_text())['metrics']
+    assert metrics['ate_rmse']['value'] < 2.0
+    assert metrics['ate_final_rmse']['value'] < 2.0
+    mapped_ns = History.from_document(
+        json.loads((out / 'map_keyframes' / 'transforms.json').read_text())['bdgs']['history']
+    ).stamps_ns
+    assert any(online.stamps_ns[7] < stamp_ns < online.stamps_ns[8] for stamp_ns in mapped_ns)
 
 
 def without_ros(bag: Path, settings: dict[str, object]) -> Trajectory:

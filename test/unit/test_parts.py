@@ -105,3 +105,33 @@ def test_the_mask_has_the_size_of_the_image() -> None:
     mask = found.mask((120, 160), 0.8)
     assert mask.shape == (120, 160)
     assert (mask[:, :36] == 204).mean() > 0.95 and (mask[:, 44:] == 0).mean() > 0.95
+
+
+def test_what_no_motion_explains_is_not_the_world() -> None:
+    """A limb that swings past: its squares show something else than what they were compared to."""
+    seen = cells(left(0.0), RESTING, RESTING)
+    limb = np.zeros((ROWS, COLUMNS), bool)
+    limb[4:7, 5:9] = True
+    seen.cost[limb.reshape(-1)] *= 30
+    found = world(seen, RESTING, UNSURE)
+    assert found.moved[limb].all()
+    assert found.moved[~limb].mean() < 0.02
+
+
+def test_the_plain_parts_of_a_thing_move_with_it() -> None:
+    """A shirt has a pattern in its middle alone; the wall behind it has one everywhere."""
+    shirt = np.zeros((ROWS, COLUMNS), bool)
+    shirt[2:, 3:10] = True
+    pattern = np.zeros_like(shirt)
+    pattern[5:8, 5:8] = True
+    seen = cells(shirt, STEP, RESTING)
+    plain = (shirt & ~pattern).reshape(-1)
+    seen.information[plain] *= 1e-6
+    seen.gradient[plain] *= 1e-6
+    seen.cost[plain] = 30.0
+    seen.plane[:, 0] = np.where(shirt.reshape(-1), 1.0, 0.25)
+    found = world(seen, RESTING, SURE)
+    assert not found.is_other
+    assert (found.moved == shirt).mean() > 0.97
+    seen.plane[:, 0] = 0.0  # nothing is known of what hangs together
+    assert (world(seen, RESTING, SURE).moved == pattern).mean() > 0.97

@@ -133,6 +133,9 @@ class PartsConfig:
     surprise: float = param(8.0, 'most that an unexpected motion counts against a part', low=0.0)
     margin: float = param(0.5, 'another part is so much more likely the world', low=0.0)
     moved: float = param(1.5, 'a square moves on its own: residuals beyond its noise', low=0.0)
+    unlike: float = param(
+        9.0, 'nor is a square the world whose residuals are so many times its noise', low=0.0
+    )
     surface: float = param(
         0.4, 'a plane moves as a whole if this share of it does', low=0.0, high=1.0
     )
@@ -209,6 +212,24 @@ class PlacesConfig:
 
 
 @dataclass(frozen=True)
+class PieceConfig:
+    """What a lost camera does: it makes a piece of map of its own until it is found again."""
+
+    enabled: bool = param(True, 'follow a lost camera in a piece of map of its own')
+    patience_s: float = param(
+        1.0, 'lost for so long before a piece begins', unit='s', low=0.0, high=3600.0
+    )
+    keyframes: int = param(60, 'of a piece that are kept for the map', low=1, high=1000)
+    young_s: float = param(
+        5.0, 'a world seen for longer is never given up', unit='s', low=0.0, high=3600.0
+    )
+    least_s: float = param(
+        0.5, 'a world seen for less is given up for a piece seen for longer', unit='s', low=0.0
+    )
+    still: float = param(0.5, 'so is a young one of whose view less was still', low=0.0, high=1.0)
+
+
+@dataclass(frozen=True)
 class TrackingConfig:
     """The camera pose of every frame."""
 
@@ -230,3 +251,4 @@ class TrackingConfig:
     features: FeatureConfig = field(default_factory=FeatureConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     places: PlacesConfig = field(default_factory=PlacesConfig)
+    piece: PieceConfig = field(default_factory=PieceConfig)

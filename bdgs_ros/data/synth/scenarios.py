@@ -5,6 +5,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -175,8 +176,7 @@ def _nobody(layout: Layout, rng: np.random.Generator, duration_s: float) -> list
     return []
 
 
-@dataclass(frozen=True)
-class Scenario:
+class Scenario(NamedTuple):
     """How the camera moves, who else does, and what the recording is like."""
 
     motion: str
@@ -205,7 +205,7 @@ _FIELD = {
     'hall': Scenario('survey', _nobody, scale=4.0),
     'close_up': Scenario('survey', _nobody, scale=0.15),
 }
-_SCENARIOS = {**_PAPER, **_FIELD}
+_SCENARIOS: dict[str, tuple[Any, ...]] = {**_PAPER, **_FIELD}
 
 
 def scenarios() -> tuple[str, ...]:
@@ -222,7 +222,7 @@ def find_scenario(name: str) -> Scenario:
     """Return a scenario; `DatasetError` if there is none of this name."""
     if name not in _SCENARIOS:
         raise DatasetError(f"no scenario '{name}'; there are: {', '.join(_SCENARIOS)}")
-    return _SCENARIOS[name]
+    return Scenario(*_SCENARIOS[name])
 
 
 def make_world(scenario: str, seed: int, duration_s: float) -> World:
