@@ -126,9 +126,14 @@ def _what_moves(
 def _whole_planes(moved: Mask, cells: Cells, config: PartsConfig) -> Mask:
     """Return planes of which much moves: all of them does, as a door near its hinges."""
     labels = planes(cells)
+    return _move_mostly(labels, moved, cells, config)[labels]
+
+
+def _move_mostly(labels: NDArray[np.intp], moved: Mask, cells: Cells, config: PartsConfig) -> Mask:
+    """Return which of the labels are of surfaces of which much moves."""
     size = np.bincount(labels, weights=cells.seen >= FEWEST)
     share = np.bincount(labels, weights=moved) / np.maximum(size, 1)
-    return np.asarray(((share > config.surface) & (size >= config.least))[labels])
+    return np.asarray((share > config.surface) & (size >= config.least))
 
 
 def _whole_things(
@@ -140,13 +145,12 @@ def _whole_things(
     What agrees with the world's motion, and not as well with the thing's, stays the world.
     """
     labels = things(cells)
-    count = np.bincount(labels, weights=moved)
     found = np.zeros_like(moved)
-    for label in np.flatnonzero(count >= config.least):
+    for label in np.flatnonzero(_move_mostly(labels, moved, cells, config)):
         own = labels == label
         motion = _agreed(cells, own & moved)
         is_world = own & ~moved & (_cost(cells, motion[None])[0] / scale - cost > config.moved)
-        if count[label] > is_world.sum():
+        if (own & moved).sum() > is_world.sum():
             found |= own & ~is_world
     return found
 

@@ -121,6 +121,7 @@ class FakeStage:
 @dataclass
 class FakeOutcome:
     tracking: TrackingResult
+    gave_up: bool = False
 
 
 @dataclass

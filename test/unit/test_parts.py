@@ -123,7 +123,7 @@ def test_the_plain_parts_of_a_thing_move_with_it() -> None:
     shirt = np.zeros((ROWS, COLUMNS), bool)
     shirt[2:, 3:10] = True
     pattern = np.zeros_like(shirt)
-    pattern[5:8, 5:8] = True
+    pattern[3:8, 3:9] = True
     seen = cells(shirt, STEP, RESTING)
     plain = (shirt & ~pattern).reshape(-1)
     seen.information[plain] *= 1e-6

@@ -137,7 +137,7 @@ class PartsConfig:
         9.0, 'nor is a square the world whose residuals are so many times its noise', low=0.0
     )
     surface: float = param(
-        0.4, 'a plane moves as a whole if this share of it does', low=0.0, high=1.0
+        0.4, 'a plane or a thing moves as a whole if this share of it does', low=0.0, high=1.0
     )
     least: int = param(6, 'squares with depth; fewer tell nothing', low=1, high=1000)
 
