@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 import time
 from collections import abc
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,9 @@ from bdgs_ros.eval.posterior import PosteriorWatch
 from bdgs_ros.eval.recorder import Recorder, RunResult
 from bdgs_ros.eval.scores import Truth
 from bdgs_ros.runner import LabelObserver, Observer, run_sequence, write_results
+from bdgs_ros.tracking.registration import RegistrationWatch
+
+_LOGGER = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -89,6 +93,7 @@ def run_job(
     """
     from bdgs_ros.pipeline import BdgsSlam
 
+    job, notes = _with_offset(job)
     sequence, truth = _open(job)
     chosen = choose_frames(len(sequence), job.start, job.frames)
     labels = None if truth is None else LabelObserver(truth)
@@ -110,6 +115,7 @@ def run_job(
         truth=truth,
         more=[*([] if labels is None else labels.score.metrics()), *more()],
         config=job.config,
+        notes=[*notes, *_apart(slam)],
         extra={'frames': [chosen.start, chosen.stop], 'wall_s': wall_s},
         keep_keyframes=job.keyframes,
         with_pictures=job.pictures,
@@ -132,17 +138,49 @@ def _run(
         slam.detection = stage
 
 
-def _open(job: Job) -> tuple[Sequence, Truth | None]:
-    from bdgs_ros.data.layouts import open_sequence
+def _apart(slam: Any) -> list[str]:
+    """Return what is wrong with colour and depth of a run that is over."""
+    watch = getattr(slam, 'registration', None)
+    if watch is None:
+        return []
+    watch.finish()
+    return [watch.objection] if watch.objection else []
 
-    sequence: Sequence = open_sequence(
-        job.recording, job.camera_file, allow_truncated=job.allow_truncated
-    )
-    truth = open_truth(job.recording)
+
+def _with_offset(job: Job) -> tuple[Job, list[str]]:
+    """Find out by how much stamps of depth are late, if that was asked for; and say so."""
+    camera = job.config.camera
+    if not camera.estimate_depth_offset:
+        return job, []
+    sequence = _paired(job)
+    first = choose_frames(len(sequence), job.start, job.frames)
+    watch = RegistrationWatch(job.config.tracking.registration)
+    late_s = watch.measured_offset_s(sequence[index] for index in first)
+    if not late_s:
+        return job, []
+    camera = replace(camera, depth_offset_s=camera.depth_offset_s + late_s)
+    note = f'stamps of depth are late by {camera.depth_offset_s:.3f} s, as measured: corrected'
+    _LOGGER.warning('%s', note)
+    return replace(job, config=replace(job.config, camera=camera)), [note]
+
+
+def _open(job: Job) -> tuple[Sequence, Truth | None]:
+    sequence, truth = _paired(job), open_truth(job.recording)
     if job.loop_frames is None:
         return sequence, truth
     loop = LoopedSequence(sequence, job.loop_frames)
     return loop, None if truth is None else LoopedTruth(truth, loop)
+
+
+def _paired(job: Job) -> Sequence:
+    from bdgs_ros.data.layouts import open_sequence
+
+    return open_sequence(
+        job.recording,
+        job.camera_file,
+        allow_truncated=job.allow_truncated,
+        depth_offset_s=job.config.camera.depth_offset_s,
+    )
 
 
 def choose_frames(available: int, start: int, count: int | None) -> range:

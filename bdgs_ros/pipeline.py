@@ -29,6 +29,7 @@ from bdgs_ros.mapping.entrance import check_entrance, entrance
 from bdgs_ros.mapping.mapper import Mapper
 from bdgs_ros.tracking.camera_tracker import CameraTracker
 from bdgs_ros.tracking.piece import Explorer, Piece
+from bdgs_ros.tracking.registration import RegistrationWatch
 from bdgs_ros.tracking.shutter import straightened
 
 
@@ -61,6 +62,7 @@ class BdgsSlam:
         self.detection = DetectionStage(config.detection, detector)
         self.tracker = CameraTracker(config.tracking)
         self.explorer = Explorer(config.tracking)
+        self.registration = RegistrationWatch(config.tracking.registration)
         self.mapper = Mapper(config.mapping, config.belief)
         self.back_end = BackEnd(config.back_end)
         self._width, self._map_width = config.camera.width, config.mapping.width
@@ -108,6 +110,7 @@ class BdgsSlam:
     def process(self, frame: RgbdFrame) -> FrameResult:
         """Take the next frame: who moves, where is the camera, what does the world look like."""
         labels = self.detection.process(frame)
+        self.registration.add(frame)
         moved = self.tracker.take_move()
         if moved is not None:
             self.mapper.history.note_move(frame.stamp_ns, moved)
@@ -145,6 +148,7 @@ class BdgsSlam:
         self.detection.reset()
         self.tracker.reset()
         self.explorer.reset()
+        self.registration.reset()
         self.mapper.reset()
 
 

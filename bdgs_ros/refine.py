@@ -233,7 +233,9 @@ class _Views:
         from bdgs_ros.job import open_truth
         from bdgs_ros.rescore import relabel
 
-        sequence = open_sequence(recording, job.camera_file)
+        sequence = open_sequence(
+            recording, job.camera_file, depth_offset_s=job.config.camera.depth_offset_s
+        )
         self.name = sequence.name
         self._truth = open_truth(recording)
         est = read_trajectory(self._trajectory_file)

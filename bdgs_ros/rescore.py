@@ -62,7 +62,7 @@ def rescore(
     from bdgs_ros.mapping.mapper import Mapper
 
     known = _known_results(folder / 'metrics.json')
-    sequence = open_sequence(recording, camera_file)
+    sequence = open_sequence(recording, camera_file, depth_offset_s=config.camera.depth_offset_s)
     est = read_trajectory(folder / 'trajectory.txt')
     mapper = Mapper(config.mapping, config.belief)
     mapper.load(folder / 'map.ply')

@@ -162,6 +162,7 @@ def write_results(
     more: Sequence[Metric] = (),
     config: BdgsConfig | None = None,
     frames_expected: int | None = None,
+    notes: Sequence[str] = (),
     extra: Mapping[str, Any] | None = None,
     save_map: bool = True,
     keep_keyframes: bool = True,
@@ -196,6 +197,8 @@ def write_results(
         Written into the metrics.
     frames_expected : int, optional
         For the coverage; by default the number of frames that came.
+    notes : sequence of str
+        What else is to be said of the run.
     extra : mapping, optional
         More entries for the metrics file, for example how the run was started.
     save_map : bool
@@ -223,7 +226,7 @@ def write_results(
     write_trajectory(folder / 'trajectory.txt', est)
     found = [*result.count_metrics(), *result.time_metrics()]
     expected = len(result.rows) if frames_expected is None else frames_expected
-    ate, notes = _compare(ground_truth, est, expected)
+    ate, objections = _compare(ground_truth, est, expected)
     found += _trajectory_metrics(est, expected, ground_truth, ate)
     if ground_truth is not None and ate is not None:
         found += honesty_metrics(ground_truth, est, result.rows)
@@ -241,7 +244,9 @@ def write_results(
         found += _final_metrics(final, ground_truth, ate)
     if with_pictures:
         _draw(folder, est, views, ground_truth, ate, name)
-    metrics = metrics_document(name, found, config, {**(extra or {}), 'notes': notes})
+    metrics = metrics_document(
+        name, found, config, {**(extra or {}), 'notes': [*notes, *objections]}
+    )
     write_text(folder / 'metrics.json', dump_json(metrics) + '\n')
     return metrics
 

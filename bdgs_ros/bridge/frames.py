@@ -13,6 +13,7 @@ from rclpy.clock_type import ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import Float64
 
 from bdgs_ros.bridge import conversions, topics
 from bdgs_ros.bridge.cdr_image import CdrImage, image_from_cdr
@@ -41,6 +42,8 @@ class RawFrame:
     info: CameraInfo
     received_s: float
     """When the later of the two arrived, monotonic clock."""
+    depth_delay_ns: int = 0
+    """From the stamp of colour to that of depth, as corrected."""
 
 
 class FrameSource:
@@ -74,6 +77,7 @@ class FrameSource:
         self._health = health
         self._on_frame = on_frame
         self._info: CameraInfo | None = None
+        self._offset_ns = seconds_to_ns(config.camera.depth_offset_s)
         self._held: deque[tuple[CdrImage, CdrImage]] = deque(maxlen=_HELD_FOR_INFO)
         self._sync: Synchroniser[CdrImage, CdrImage] = Synchroniser(
             seconds_to_ns(config.sync.tolerance_s),
@@ -81,6 +85,7 @@ class FrameSource:
             Patience.EAGER if config.lockstep else Patience.PREDICT,
             on_jump,
         )
+        node.create_subscription(Float64, topics.DEPTH_OFFSET, self._on_offset, topics.LATCHED)
         self._names = {
             topic: node.resolve_topic_name(topic)
             for topic in (topics.COLOR, topics.DEPTH, topics.COLOR_INFO)
@@ -92,6 +97,15 @@ class FrameSource:
         self._timer = node.create_timer(
             _WATCH_PERIOD_S, self._watch, clock=Clock(clock_type=ClockType.STEADY_TIME)
         )
+
+    @property
+    def depth_offset_s(self) -> float:
+        """By how much stamps of depth are taken to be late."""
+        return 1e-9 * self._offset_ns
+
+    def _on_offset(self, message: Float64) -> None:
+        self._offset_ns = seconds_to_ns(message.data)
+        self._sync.clear()  # what waits has stamps as they were
 
     def clear(self) -> None:
         """Forget images that wait for a partner."""
@@ -139,7 +153,10 @@ class FrameSource:
     def _on_depth(self, message: bytes) -> None:
         self._watchdog.note(self._names[topics.DEPTH], time.monotonic())
         image = image_from_cdr(message)
-        self._emit(self._sync.add_right(conversions.stamp_ns(image), image))
+        self._emit(self._sync.add_right(self._stamp_of_depth(image), image))
+
+    def _stamp_of_depth(self, image: CdrImage) -> int:
+        return conversions.stamp_ns(image) - self._offset_ns
 
     def _emit(self, pairs: list[tuple[CdrImage, CdrImage]]) -> None:
         for color, depth in pairs:
@@ -147,7 +164,9 @@ class FrameSource:
                 self._held.append((color, depth))
                 continue
             stamp_ns = conversions.stamp_ns(color)
-            self._on_frame(RawFrame(stamp_ns, color, depth, self._info, time.monotonic()))
+            delay_ns = self._stamp_of_depth(depth) - stamp_ns
+            now_s = time.monotonic()
+            self._on_frame(RawFrame(stamp_ns, color, depth, self._info, now_s, delay_ns))
         self._count()
 
     def _count(self) -> None:
@@ -227,7 +246,11 @@ class FrameDecoder:
         self._check_depth(depth_m, raw.depth.encoding)
         rectifier = self._rectifier_of(camera)
         return RgbdFrame(
-            raw.stamp_ns, rectifier.color(color), rectifier.depth(depth_m), rectifier.camera
+            raw.stamp_ns,
+            rectifier.color(color),
+            rectifier.depth(depth_m),
+            rectifier.camera,
+            raw.depth_delay_ns,
         )
 
     def camera(self, raw: RawFrame) -> PinholeCamera:

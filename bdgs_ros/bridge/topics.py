@@ -27,6 +27,8 @@ PIECE = 'bdgs/piece'
 """The poses of frames that were seen while the camera was lost, once it is known where."""
 PIECE_KEYFRAME = 'bdgs/piece/keyframe'
 """Which of them mapping shall keep the images of; the pose is in the piece."""
+DEPTH_OFFSET = 'bdgs/depth_offset'
+"""By how much stamps of depth are late, s, if tracking has measured it and may correct it."""
 MODEL_IMAGE = 'bdgs/model/image'
 MODEL_DEPTH = 'bdgs/model/depth'
 MODEL_DYNAMIC = 'bdgs/model/dynamic'

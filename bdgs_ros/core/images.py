@@ -68,7 +68,9 @@ def shrink_frame(frame: RgbdFrame, width: int) -> RgbdFrame:
     size = (camera.width, camera.height)
     color = cv2.resize(frame.color, size, interpolation=cv2.INTER_AREA)
     depth_m = sample_depth(frame.depth_m, camera.shape)
-    return RgbdFrame(frame.stamp_ns, np.asarray(color, np.uint8), depth_m, camera)
+    return RgbdFrame(
+        frame.stamp_ns, np.asarray(color, np.uint8), depth_m, camera, frame.depth_delay_ns
+    )
 
 
 def shrink_labels(p_dynamic: ProbabilityImage, shape: tuple[int, int]) -> ProbabilityImage:

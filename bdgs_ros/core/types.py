@@ -33,6 +33,8 @@ class RgbdFrame:
     color: ColorImage
     depth_m: DepthImage
     camera: PinholeCamera
+    depth_delay_ns: int = 0
+    """From the stamp, which is that of colour, to that of the depth image."""
 
     def __post_init__(self) -> None:
         """Refuse images that do not fit the camera."""

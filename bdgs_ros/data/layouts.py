@@ -65,9 +65,15 @@ def open_sequence(
     camera_file: Path | str | None = None,
     max_difference_s: float = MAX_DIFFERENCE_S,
     allow_truncated: bool = False,
+    depth_offset_s: float = 0.0,
 ) -> RecordedSequence:
-    """Open a recording of any known layout as rectified RGB-D frames; see `open_recording`."""
-    return RecordedSequence(open_recording(path, camera_file, allow_truncated), max_difference_s)
+    """
+    Open a recording of any known layout as rectified RGB-D frames.
+
+    See `open_recording` and `RecordedSequence`.
+    """
+    recording = open_recording(path, camera_file, allow_truncated)
+    return RecordedSequence(recording, max_difference_s, depth_offset_s)
 
 
 def _open_tum_like(folder: Path, given: RecordedCamera | None) -> Recording:

@@ -150,6 +150,8 @@ class RecordedSequence:
         Where the images come from.
     max_difference_s : float
         Colour and depth further apart than this are not one frame.
+    depth_offset_s : float
+        By so much the stamps of depth are late.
 
     Raises
     ------
@@ -158,10 +160,18 @@ class RecordedSequence:
 
     """
 
-    def __init__(self, recording: Recording, max_difference_s: float = MAX_DIFFERENCE_S) -> None:
+    def __init__(
+        self,
+        recording: Recording,
+        max_difference_s: float = MAX_DIFFERENCE_S,
+        depth_offset_s: float = 0.0,
+    ) -> None:
         self.recording = recording
+        self._offset_ns = seconds_to_ns(depth_offset_s)
         self._pairs = associate(
-            recording.color_stamps_ns, recording.depth_stamps_ns, seconds_to_ns(max_difference_s)
+            recording.color_stamps_ns,
+            recording.depth_stamps_ns - self._offset_ns,
+            seconds_to_ns(max_difference_s),
         )
         self._rectifier = Rectifier(recording.camera)
         self.stamps_ns: NDArray[np.int64] = np.array(
@@ -223,7 +233,13 @@ class RecordedSequence:
             self._rectifier.color(self.recording.read_color(color)),
             self._rectifier.depth(self.recording.read_depth(depth)),
             self._rectifier.camera,
+            self._delay_ns(color, depth),
         )
+
+    def _delay_ns(self, color: int, depth: int) -> int:
+        """Return by how much depth is later than colour, as far as the offset is right."""
+        stamps_ns = self.recording.color_stamps_ns[color], self.recording.depth_stamps_ns[depth]
+        return int(stamps_ns[1] - stamps_ns[0]) - self._offset_ns
 
     def __iter__(self) -> Iterator[RgbdFrame]:
         """Read all frames in order."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from std_msgs.msg import Empty
+from std_msgs.msg import Empty, Float64
 
 from bdgs_ros.bridge import parameters, topics
 from bdgs_ros.bridge.feedback import FIRST_ABSENT_S, Feedback
@@ -33,6 +33,7 @@ from bdgs_ros.data.trajectory_io import write_trajectory
 from bdgs_ros.mapping.map_files import load_places
 from bdgs_ros.tracking.camera_tracker import CameraTracker
 from bdgs_ros.tracking.piece import Explorer, Piece
+from bdgs_ros.tracking.registration import RegistrationWatch
 
 _MOST_WAITING = 30  # frames, however slow tracking is; it takes the newest of them
 _AT_RUN_TIME = ('map_file', 'trajectory_file')
@@ -53,9 +54,12 @@ class TrackingNode(GraphNode):
         self._health = Health(self, 'tracking')
         self._tracker = CameraTracker(config.tracking)
         self._explorer = Explorer(config.tracking)
+        self._registration = RegistrationWatch(config.tracking.registration)
+        self._newest: RgbdFrame | None = None  # to measure that by
         self._joined: list[Piece] = []  # that mapping is to hear of
         self._output = PoseOutput(self, config)
         self._status = self.create_publisher(DiagnosticArray, topics.STATUS, topics.RELIABLE)
+        self._offset = self.create_publisher(Float64, topics.DEPTH_OFFSET, topics.LATCHED)
         self._reset_event = self.create_publisher(Empty, topics.RESET_EVENT, topics.RELIABLE)
         self._feedback = Feedback(self, config, self._health)
         self._decoder = FrameDecoder.of(self)
@@ -143,6 +147,7 @@ class TrackingNode(GraphNode):
 
     def _track(self, raw: RawFrame, frame: RgbdFrame) -> None:
         self._tell_joined()
+        self._newest = frame
         labels = self._feedback.labels(frame)
         frame = halved(frame, self._config.camera.width)
         labels = labels and fitted(labels, frame)
@@ -237,6 +242,23 @@ class TrackingNode(GraphNode):
         """After each frame, its pose being out."""
         if self._has_begun:
             self._tracker.rest()
+        if self._newest is not None and not self._is_hurried():
+            self._measure(self._newest)
+        self._newest = None
+
+    def _measure(self, frame: RgbdFrame) -> None:
+        """Find out whether colour and depth belong together; correct stamps if that is allowed."""
+        watch = self._registration
+        watch.add(frame)
+        self._health.mark('registration', watch.objection)
+        found, config = watch.found, self._config
+        is_late = found is not None and found.is_late(config.tracking.registration)
+        if found is None or not is_late or not config.camera.estimate_depth_offset:
+            return
+        offset_s = self._source.depth_offset_s + found.depth_offset_s
+        self.get_logger().warning(f'stamps of depth are late by {offset_s:.3f} s: corrected')
+        self._offset.publish(Float64(data=offset_s))
+        watch.reset()
 
     def _forget(self) -> None:
         """Start over: the next frame is the origin of the world."""

@@ -230,6 +230,25 @@ class PieceConfig:
 
 
 @dataclass(frozen=True)
+class RegistrationConfig:
+    """When colour and depth are apart, in time or by pixels; measured on edges of both."""
+
+    enabled: bool = param(True, 'measure whether depth belongs to colour, and warn')
+    window_s: float = param(5.0, 'measured by so much', unit='s', low=1.0, high=60.0)
+    frames: int = param(150, 'or by so many frames', low=30, high=1000)
+    least_frames: int = param(20, 'fewer tell nothing', low=20, high=1000)
+    pause_s: float = param(
+        60.0, 'between measurements after the second', unit='s', low=0.0, high=3600.0
+    )
+    steps: int = param(4, 'of the measurement in each frame, about a millisecond each', low=1)
+    lag_s: float = param(
+        0.02, 'less is not called late, beyond three sigma', unit='s', low=0.0, high=10.0
+    )
+    scale: float = param(0.03, 'nor is less called another scale', low=0.0, high=1.0)
+    shift: float = param(0.0125, 'or another place', unit='share of the width', low=0.0, high=1.0)
+
+
+@dataclass(frozen=True)
 class TrackingConfig:
     """The camera pose of every frame."""
 
@@ -252,3 +271,4 @@ class TrackingConfig:
     loss: LossConfig = field(default_factory=LossConfig)
     places: PlacesConfig = field(default_factory=PlacesConfig)
     piece: PieceConfig = field(default_factory=PieceConfig)
+    registration: RegistrationConfig = field(default_factory=RegistrationConfig)
