@@ -550,6 +550,7 @@ class CameraTracker:
         if len(self._tracked) > _MOST_TRACKED:
             del self._tracked[min(self._tracked)]
         self._choice.begin(frame)
+        self._motion.look(self._choice.depth_m)
         self._places.add(frame, T_world_camera, p_dynamic)
         known = {place.stamp_ns for place in self._places} | {frame.stamp_ns}
         self._doubt = {stamp_ns: self._doubt[stamp_ns] for stamp_ns in known & self._doubt.keys()}

@@ -26,7 +26,8 @@ class KeyframeChoice:
 
     def begin(self, keyframe: RgbdFrame | None) -> None:
         """Start anew at a keyframe."""
-        self._depth_m = 1.0 if keyframe is None else _median_depth(keyframe)
+        self.depth_m = 1.0 if keyframe is None else _median_depth(keyframe)
+        """Of the keyframe's view, median."""
         self._frames = 0
         self._least_sigma = np.inf
 
@@ -44,7 +45,7 @@ class KeyframeChoice:
         All are against the last keyframe; the model view may be of an older one, when mapping is
         behind.
         """
-        move = float(np.linalg.norm(T_keyframe_camera[:3, 3])) / self._depth_m
+        move = float(np.linalg.norm(T_keyframe_camera[:3, 3])) / self.depth_m
         self._least_sigma = min(self._least_sigma, sigma_share)
         turn = np.rad2deg(se3.rotation_angle_rad(T_keyframe_camera))
         return bool(

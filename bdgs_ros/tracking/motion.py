@@ -28,6 +28,7 @@ _START_SPEED = 0.5  # m/s, standard deviation of the velocity while nothing is k
 _START_SPIN = 1.0  # rad/s
 _LATELY_S = 0.5
 _FASTER, _CALMER, _MOST_UNREST = 2.0, 0.95, 100.0  # of the variance of the acceleration
+_USUAL_DEPTH_M = 3.0  # of the rooms that people carry cameras through
 _LAG_GAIN = 0.2
 _LAG_VARIANCE = _LAG_GAIN / (2 - _LAG_GAIN)  # of a mean of white noise
 _SURPRISING = 6.0  # times that
@@ -60,6 +61,17 @@ class MotionPredictor:
         self._state: _State | None = None
         self._last: tuple[_State, _State] | None = None  # a state and where it was moved to
         self._unrest, self._lag = 1.0, np.zeros(6)
+        self._depth_m = _USUAL_DEPTH_M
+
+    def look(self, depth_m: float) -> None:
+        """
+        Take at what depth the camera looks: where all is far it may move faster.
+
+        Whatever carries it through a hall or over a field keeps what it sees in view, and does
+        not the more gently for that. Otherwise the prediction outweighs images that show little
+        of a move.
+        """
+        self._depth_m = depth_m
 
     def reset(self) -> None:
         """Forget pose and velocity."""
@@ -211,7 +223,7 @@ class MotionPredictor:
 
     def _process_noise(self, dt: float) -> Matrix:
         """Return the noise of an acceleration that is constant over the step but unknown."""
-        linear = self._config.acceleration_sigma
+        linear = self._config.acceleration_sigma * max(1.0, self._depth_m / _USUAL_DEPTH_M)
         angular = self._config.angular_acceleration_sigma
         push = np.vstack([0.5 * dt**2 * np.eye(6), dt * np.eye(6)])
         accelerations = np.diag([linear**2] * 3 + [angular**2] * 3)

@@ -115,7 +115,10 @@ def _what_moves(
 ) -> Mask:
     """Return the squares that are not the world, which moves by `step`."""
     cost = _cost(cells, step[None])[0] / scale
-    moved: Mask = asked & ((cost - least / scale > config.moved) | (cost > config.unlike))
+    moved: Mask = asked & (cost - least / scale > config.moved)
+    # A limb that swings past agrees with no motion; so do single squares of a blurred room.
+    unlike, labels = asked & (cost > config.unlike), things(cells)
+    moved |= unlike & _move_mostly(labels, moved | unlike, cells, config)[labels]
     for whole in (_whole_planes, partial(_whole_things, cost=cost, scale=scale)):
         grown = moved | (asked & whole(moved, cells, config))
         if area[~grown].sum() > _LEFT:

@@ -18,7 +18,7 @@ class MotionConfig:
         choices=('none', 'velocity', 'kalman'),
     )
     acceleration_sigma: float = param(
-        3.0, 'white-noise acceleration', unit='m/s^2', low=0.0, high=100.0
+        3.0, 'white-noise acceleration, in a room', unit='m/s^2', low=0.0, high=100.0
     )
     angular_acceleration_sigma: float = param(
         10.0, 'white-noise angular acceleration', unit='rad/s^2', low=0.0, high=1000.0
