@@ -124,7 +124,10 @@ class BdgsSlam:
         if tracking.status is TrackingStatus.OK:
             self.back_end.observe(frame.stamp_ns, tracking.T_world_camera)
         if tracking.is_keyframe:
-            keyframe = Keyframe(frame, tracking.T_world_camera, fitting.p_dynamic)
+            p_dynamic = fitting.p_dynamic
+            if tracking.p_moving is not None:
+                p_dynamic = np.maximum(p_dynamic, tracking.p_moving)
+            keyframe = Keyframe(frame, tracking.T_world_camera, p_dynamic)
             self.tracker.set_model(take_keyframe(self.back_end, self.mapper, keyframe))
             self.tracker.note_keyframes(self.mapper.keyframe_poses())
         return FrameResult(labels, tracking, piece is not None and piece.is_new_world)

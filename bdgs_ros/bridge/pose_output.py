@@ -7,6 +7,7 @@ import time
 from geometry_msgs.msg import PoseStamped, Vector3
 from nav_msgs.msg import Odometry, Path
 from rclpy.node import Node
+from sensor_msgs.msg import Image
 
 from bdgs_ros.bridge import conversions, topics
 from bdgs_ros.bridge.node_config import TrackingNodeConfig
@@ -41,6 +42,7 @@ class PoseOutput:
         self._odometry = node.create_publisher(Odometry, topics.ODOMETRY, topics.RELIABLE)
         self._path = node.create_publisher(Path, topics.PATH, topics.LATCHED)
         self._keyframe = node.create_publisher(PoseStamped, topics.KEYFRAME, topics.RELIABLE)
+        self._moving = node.create_publisher(Image, topics.KEYFRAME_MOVING, topics.RELIABLE)
         self._piece = node.create_publisher(Path, topics.PIECE, topics.RELIABLE)
         self._piece_keyframe = node.create_publisher(
             PoseStamped, topics.PIECE_KEYFRAME, topics.RELIABLE
@@ -86,6 +88,10 @@ class PoseOutput:
         )
         self._pose.publish(pose)
         if result.is_keyframe:
+            if result.p_moving is not None:  # before the keyframe, which mapping waits for
+                self._moving.publish(
+                    conversions.probability_to_message(result.p_moving, pose.header)
+                )
             self._keyframe.publish(pose)
         self._transform.publish(pose, child)
         self._publish_odometry(result, pose, child, previous)

@@ -19,6 +19,8 @@ KEYFRAMES = 'bdgs/keyframes'
 STATUS = 'bdgs/status'
 """One message per image that tracking took: the acknowledgement that lockstep waits for."""
 KEYFRAME = 'bdgs/keyframe'
+KEYFRAME_MOVING = 'bdgs/keyframe/moving'
+"""What is large in a keyframe and moves on its own though no label says so, mono8."""
 SHED = 'bdgs/shed'
 """What is to be left out so that tracking keeps up, see `bridge.governor`."""
 MOVE = 'bdgs/move'

@@ -112,6 +112,8 @@ class TrackingResult:
     """Full image: the prior joined with what tracking saw move."""
     inlier_ratio: float = 0.0
     overlap: float = 0.0
+    p_moving: ProbabilityImage | None = None
+    """Full image: what is large and moves on its own though the prior does not say so, if any."""
 
 
 @dataclass(frozen=True)

@@ -84,6 +84,7 @@ class MappingNode(GraphNode):
         self._lock = self._live.lock  # of the mapper: worker and services
         self._frames: StampBuffer[RawFrame] = StampBuffer(config.frame_buffer)
         self._labels: StampBuffer[CdrImage] = StampBuffer(_LABELS_KEPT)
+        self._moving: StampBuffer[CdrImage] = StampBuffer(_LABELS_KEPT)
         self._decoder = FrameDecoder.of(self)
         self._models = ModelPublisher(self, self._config.map_frame)
         self._output = MapOutput(self, config, self._health)
@@ -132,6 +133,9 @@ class MappingNode(GraphNode):
         self.create_subscription(
             Empty, topics.RESET_EVENT, lambda _: self._forget(), topics.RELIABLE
         )
+        self.create_subscription(
+            Image, topics.KEYFRAME_MOVING, self._keep_moving, topics.RELIABLE, raw=True
+        )
         hear_load(self, self._on_load)
         self._keyframes = self.create_publisher(PathMessage, topics.KEYFRAMES, topics.LATCHED)
 
@@ -141,6 +145,10 @@ class MappingNode(GraphNode):
     def _keep_frame(self, raw: RawFrame) -> None:
         self._frames.put(raw.stamp_ns, raw)
         self._entrance.note_frame(raw)
+
+    def _keep_moving(self, message: bytes) -> None:
+        image = image_from_cdr(message)
+        self._moving.put(conversions.stamp_ns(image), image)
 
     def _keep_labels(self, message: bytes) -> None:
         image = image_from_cdr(message)
@@ -294,9 +302,18 @@ class MappingNode(GraphNode):
         return Keyframe(frame, conversions.pose_from_message(message.pose), labels)
 
     def _labels_of(self, frame: RgbdFrame, wait_s: float) -> ProbabilityImage:
-        """Return the labels of a frame; in real time the nearest ones will do, after a wait."""
+        """Return what may move in a frame: by its labels, and by what tracking saw move."""
         if self._mapper.frozen:  # they would change nothing
             return np.zeros(frame.camera.shape, np.uint8)
+        labels = self._labels_alone(frame, wait_s)
+        message = self._moving.get(frame.stamp_ns)
+        if message is None:
+            return labels
+        moving = conversions.probability_from_message(message, topics.KEYFRAME_MOVING)
+        return np.maximum(labels, moving) if moving.shape == labels.shape else labels
+
+    def _labels_alone(self, frame: RgbdFrame, wait_s: float) -> ProbabilityImage:
+        """Return the labels of a frame; in real time the nearest ones will do, after a wait."""
         message = self._find_labels(frame.stamp_ns, wait_s)
         lockstep = self._config.lockstep
         if message is None:

@@ -356,8 +356,10 @@ class CameraTracker:
         """Align coarse to fine, see what moves, refine against the rendered static map."""
         first = self._align(start.reference, current, start.T_world_camera, start.information)
         parts, coarse = self._find_world(start, current, first), first
+        p_moving = None
         if parts is not None:
             moved = parts.mask(prior.shape, self._config.movers.p_dynamic)
+            p_moving = parts.large(prior, self._config.movers.p_dynamic)
             prior = np.maximum(prior, moved)
             if parts.is_other or parts.moved.mean() > _LEAST_MOVED:
                 coarse, current = self._align_world(start, current, prior, first, parts)
@@ -365,7 +367,7 @@ class CameraTracker:
         current = self._aligner.with_dynamic(current, p_dynamic, self._sweep(stamp_ns, coarse))
         fine = self._refine(current, coarse, start.information)
         spread = self._relative_covariance(parts, first, coarse, fine)
-        return Attempt(start, current, coarse, fine, p_dynamic, spread)
+        return Attempt(start, current, coarse, fine, p_dynamic, spread, p_moving)
 
     def _relative_covariance(
         self, parts: Parts | None, first: Estimate, coarse: Estimate, best: Estimate
@@ -575,4 +577,5 @@ def _result(
         attempt.p_dynamic,
         found.quality.inlier_ratio,
         attempt.coarse.quality.overlap,
+        attempt.p_moving,
     )

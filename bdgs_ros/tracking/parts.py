@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bdgs_ros.core.config.tracking import PartsConfig
-from bdgs_ros.core.types import ProbabilityImage
+from bdgs_ros.core.types import DYNAMIC_THRESHOLD, ProbabilityImage
 from bdgs_ros.tracking.align import Cells
 from bdgs_ros.tracking.surfaces import planes, things
 
@@ -30,6 +30,7 @@ FEWEST = 6  # points of a square that is asked
 _LIKELY, _ROUNDS = 4, 3  # motions that are refined, and how often
 _LOOSE = np.diag([0.1**-2] * 3 + [0.1**-2] * 3)  # m and rad: a proposal stays in the linear range
 _LEFT = 0.25  # of the surface has to remain
+_LARGE, _CLEARLY = 0.15, 8.0  # share of the view, and excess: for keyframes to go by
 _LEAST_NOISE = 0.3  # residuals over those of the sensor
 
 
@@ -41,16 +42,41 @@ class Parts:
     """Shape (6,): xi of the world, `exp(xi) @ T_current_reference`."""
     moved: Mask
     """Shape (rows, columns)."""
+    excess: Array
+    """How much worse the world's motion explains a square than the best, [rows, columns]."""
     cells: Cells
     is_other: bool
     """Whether the world is another part than the one that was aligned."""
 
     def mask(self, shape: tuple[int, int], p_dynamic: float) -> ProbabilityImage:
         """Return P(dynamic) x 255 of an image of this shape."""
-        value = np.uint8(round(255 * p_dynamic))
-        image = np.where(self.moved, value, np.uint8(0))
-        size = (shape[1], shape[0])
-        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST), np.uint8)
+        return _grown(self.moved, shape, p_dynamic)
+
+    def large(self, prior: ProbabilityImage, p_dynamic: float) -> ProbabilityImage | None:
+        """
+        Return the same of what is large, clearly moves, and is not in the prior; None for nothing.
+
+        Keyframes go by this: what they call dynamic is no landmark and does not enter the map, so
+        that single squares must not be called so.
+        """
+        size = (self.moved.shape[1], self.moved.shape[0])
+        is_named = cv2.resize(prior, size, interpolation=cv2.INTER_AREA) > DYNAMIC_THRESHOLD
+        unnamed = (self.moved & ~is_named).astype(np.uint8)
+        count, label = cv2.connectedComponents(
+            cv2.morphologyEx(unnamed, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+        )
+        large = np.zeros_like(self.moved)
+        for i in range(1, count):
+            own = label == i
+            large |= own & (own.mean() > _LARGE and np.median(self.excess[own]) > _CLEARLY)
+        return _grown(large, prior.shape, p_dynamic) if large.any() else None
+
+
+def _grown(squares: Mask, shape: tuple[int, int], p_dynamic: float) -> ProbabilityImage:
+    value = np.uint8(round(255 * p_dynamic))
+    image = np.where(squares, value, np.uint8(0))
+    size = (shape[1], shape[0])
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST), np.uint8)
 
 
 def find_world(
@@ -101,7 +127,9 @@ def find_world(
         losses = loss(likely, _cost(cells, likely))
         step, is_other = likely[np.argmin(losses)], True
     moved = _what_moves(cells, asked, step, least, scale, area, config)
-    return Parts(step, moved.reshape(-1, cells.columns), cells, is_other)
+    excess = (_cost(cells, step[None])[0] - least) / scale
+    image = (-1, cells.columns)
+    return Parts(step, moved.reshape(image), excess.reshape(image), cells, is_other)
 
 
 def _what_moves(

@@ -53,6 +53,8 @@ class Attempt:
     p_dynamic: ProbabilityImage
     covariance: NDArray[np.float64]
     """Shape (6, 6): of the best estimate relative to the reference of the start."""
+    p_moving: ProbabilityImage | None = None
+    """See `TrackingResult`."""
 
 
 @dataclass(frozen=True)
