@@ -11,6 +11,7 @@ from bdgs_ros.bench.accuracy_summary import FULL
 from bdgs_ros.bench.harness import Cell, Options
 from bdgs_ros.bench.sequences import REAL
 from bdgs_ros.core.config import BdgsConfig, specs
+from bdgs_ros.eval.honesty import WITHIN
 
 NAME = 'accuracy'
 SEEDS = 5
@@ -18,6 +19,7 @@ PARALLEL = True
 prepare = sequences.prepare
 summarise = accuracy_summary.summarise
 overviews = accuracy_summary.overviews
+draw = accuracy_summary.draw_reliability
 PROTOCOL = """
 Every colour frame with depth goes through the pipeline in order, none dropped; truth is used for
 the figures alone. online: the pose as tracking gave it at its frame; final: with what mapping
@@ -60,6 +62,7 @@ _COLUMNS = {
     'frames': 'frames_in',
     'nees': 'nees',
     'beyond_3_sigma_pct': 'beyond_3_sigma',
+    **{f'within_{share}_pct': f'within_{share}' for share in WITHIN},
     'tracking_ms': 'tracking_median',
     'tracking_p95_ms': 'tracking_p95',
 }

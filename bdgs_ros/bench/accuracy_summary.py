@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from bdgs_ros.bench import sequences
 from bdgs_ros.bench.columns import Row, is_synth, median, without_empty, worst
+from bdgs_ros.eval.honesty import WITHIN
 
 FULL = 'weights'
 """The configuration that is the whole method."""
@@ -44,6 +46,20 @@ def overviews(rows: Sequence[Row]) -> dict[str, list[dict[str, Any]]]:
         'Parts left out: online / final in cm, medians over the same seeds': _by_switch(rows),
     }
     return {title: lines for title, lines in tables.items() if lines}
+
+
+def draw_reliability(rows: Sequence[Row], folder: Path) -> None:
+    """Draw how many poses of the whole method are as near as they say, medians over seeds."""
+    from bdgs_ros.eval import plots
+
+    found = {}
+    for name in dict.fromkeys(row['sequence'] for row in rows):
+        own = [r for r in rows if r['sequence'] == name and r['configuration'] == FULL]
+        shares = {share: median(own, f'within_{share}_pct') for share in WITHIN}
+        found[name] = {share: value for share, value in shares.items() if value is not None}
+    found = {name: shares for name, shares in found.items() if shares}
+    if found:
+        plots.plot_reliability(folder / 'reliability.png', found)
 
 
 def _by_recording(rows: Sequence[Row]) -> list[dict[str, Any]]:

@@ -7,6 +7,7 @@ run that was interrupted goes on where it stopped. More is optional:
 
 - `TABLES`: titles with the columns of each, where one table would be too wide;
 - `overviews(rows)`: further tables, title to rows, of the rows that succeeded;
+- `draw(rows, folder)`: pictures of them;
 - `SEEDS`: how many random seeds unless the command line says so (1);
 - `ISOLATED = True`: every cell has a process of its own, so that its peak of memory is not that
   of the cell before;
@@ -158,6 +159,9 @@ def run_bench(
     results = _document(bench, options, [rows[place] for place in range(len(chosen))])
     write_text(options.work / 'results.json', dump_json(results) + '\n')
     write_text(options.work / 'results.md', to_markdown(results))
+    draw = getattr(bench, 'draw', None)
+    if draw is not None:
+        draw([row for row in results['rows'] if 'error' not in row], options.work)
     return results
 
 

@@ -13,6 +13,8 @@ from bdgs_ros.eval.metric import Metric
 from bdgs_ros.eval.recorder import FrameRow
 
 _THREE_SIGMA = 14.16  # chi-square of 3 degrees of freedom that 0.27 % exceed
+WITHIN = {50: 2.366, 80: 4.642, 95: 7.815, 99: 11.345}
+"""Shares in percent, and the chi-square that such a share of honest errors is below."""
 _LEAST_VARIANCE = 1e-10  # m^2: the first pose is the origin and has none
 
 
@@ -32,7 +34,8 @@ def honesty_metrics(gt: Trajectory, est: Trajectory, rows: Sequence[FrameRow]) -
     metrics : list of Metric
         `nees`: mean of the three-dimensional error squared over its covariance, after rigid
         alignment of all positions; 3 is honest, less is modest. `beyond_3_sigma`: share of
-        poses.
+        poses. `within_50` and so on: share of poses in the ellipsoids in which 50 % of honest
+        ones are.
 
     """
     known = {
@@ -50,7 +53,15 @@ def honesty_metrics(gt: Trajectory, est: Trajectory, rows: Sequence[FrameRow]) -
     if not squared:
         return []
     beyond = 100.0 * float(np.mean(np.array(squared) > _THREE_SIGMA))
-    return [Metric('nees', float(np.mean(squared))), Metric('beyond_3_sigma', beyond, '%')]
+    within = {
+        share: 100.0 * float(np.mean(np.array(squared) <= limit))
+        for share, limit in WITHIN.items()
+    }
+    return [
+        Metric('nees', float(np.mean(squared))),
+        Metric('beyond_3_sigma', beyond, '%'),
+        *(Metric(f'within_{share}', found, '%') for share, found in within.items()),
+    ]
 
 
 def _squared(

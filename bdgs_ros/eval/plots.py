@@ -19,6 +19,7 @@ _TRUTH = '#52514e'
 _INK = '#0b0b0b'
 _GRID = '#e4e3df'
 _LINES = (_ESTIMATE, '#c2410c', '#52514e', '#7c3aed')
+_STYLES = 'o-', 's--', '^:', 'v-.'
 _AXES = 'xyz'
 
 
@@ -64,6 +65,35 @@ def plot_trajectory(
         _draw_path(columns[0], est.positions, None)
     if title:
         figure.suptitle(title, color=_INK, fontsize=11)
+    write_aside(path, lambda aside: figure.savefig(aside, dpi=130))
+
+
+def plot_reliability(path: Path, within: Mapping[str, Mapping[int, float]]) -> None:
+    """
+    Draw which share of poses is in ellipsoids that a share of honest ones is in.
+
+    Parameters
+    ----------
+    path : Path
+        A .png, .pdf or .svg file.
+    within : mapping of str to mapping of int to float
+        For each recording, the share found by the share that is honest, both in percent.
+
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.4, 4.2), layout='constrained')
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    axes.plot([0, 100], [0, 100], color='0.6', lw=1, label='honest')
+    for i, (name, shares) in enumerate(within.items()):
+        style, color = _STYLES[i // len(_LINES) % len(_STYLES)], _LINES[i % len(_LINES)]
+        axes.plot(list(shares), list(shares.values()), style, color=color, ms=4, label=name)
+    axes.set(xlabel='said [% of poses]', ylabel='found [%]', xlim=(40, 100), ylim=(0, 101))
+    axes.set_title('above the line: modest; below: further off than was said', fontsize=9)
+    axes.legend(frameon=False, fontsize=7, loc='center left', bbox_to_anchor=(1, 0.5))
+    _tidy(axes)
     write_aside(path, lambda aside: figure.savefig(aside, dpi=130))
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from bdgs_ros.core import se3
 from bdgs_ros.core.types import StampedPose, TrackingStatus, Trajectory
-from bdgs_ros.eval.honesty import honesty_metrics
+from bdgs_ros.eval.honesty import WITHIN, honesty_metrics
 from bdgs_ros.eval.recorder import FrameRow
 
 COUNT = 400
@@ -42,6 +42,8 @@ def test_honest_covariances() -> None:
     found = metrics(1.0)
     assert found['nees'] == pytest.approx(3.0, rel=0.15)
     assert found['beyond_3_sigma'] < 2
+    for share in WITHIN:
+        assert found[f'within_{share}'] == pytest.approx(share, abs=6)
 
 
 def test_boasting_shows() -> None:
