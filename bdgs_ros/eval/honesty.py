@@ -52,16 +52,17 @@ def honesty_metrics(gt: Trajectory, est: Trajectory, rows: Sequence[FrameRow]) -
     ]
     if not squared:
         return []
-    beyond = 100.0 * float(np.mean(np.array(squared) > _THREE_SIGMA))
-    within = {
-        share: 100.0 * float(np.mean(np.array(squared) <= limit))
-        for share, limit in WITHIN.items()
-    }
+    beyond = 100.0 - _percent_below(squared, _THREE_SIGMA)
+    within = {share: _percent_below(squared, limit) for share, limit in WITHIN.items()}
     return [
         Metric('nees', float(np.mean(squared))),
         Metric('beyond_3_sigma', beyond, '%'),
         *(Metric(f'within_{share}', found, '%') for share, found in within.items()),
     ]
+
+
+def _percent_below(squared: Sequence[float], limit: float) -> float:
+    return 100.0 * float(np.mean(np.array(squared) <= limit))
 
 
 def _squared(

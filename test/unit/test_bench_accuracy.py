@@ -112,3 +112,22 @@ def test_overviews_compare_parts_over_the_seeds_that_both_have():
 
 def test_without_switches_there_is_no_table_of_parts():
     assert len(accuracy.overviews(rows()[:4])) == 1
+
+
+def test_the_diagram_shows_how_honest_the_whole_method_is(tmp_path):
+    shares = {50: 40.0, 80: 70.0, 95: 90.0, 99: 97.0}
+    measured = [
+        {
+            'sequence': name,
+            'configuration': 'weights',
+            'seed': 0,
+            **{f'within_{said}_pct': found for said, found in shares.items()},
+        }
+        for name in ('bonn_crowd_part', 'synth_static', 'synth_crowd', 'synth_door', 'synth_hall')
+    ]
+    accuracy.draw([*measured, {'sequence': 'x', 'configuration': 'no_masks', 'seed': 0}], tmp_path)
+    picture = cv2.imread(str(tmp_path / 'reliability.png'))
+    assert picture is not None
+    assert picture.std() > 10
+    accuracy.draw([], tmp_path / 'nowhere')
+    assert not (tmp_path / 'nowhere').exists()
