@@ -146,8 +146,9 @@ class FolderRecording:
         self.depth_stamps_ns = _stamps(self._depth)
 
     def color_name(self, index: int) -> str:
-        """Return the path of a colour image inside the folder."""
-        return str(self._color[index].path.relative_to(self._folder))
+        """Return the path of a colour image inside the folder, or where else it lies."""
+        path = self._color[index].path
+        return str(path.relative_to(self._folder) if path.is_relative_to(self._folder) else path)
 
     def read_color(self, index: int) -> ColorImage:
         """Read one colour image, distorted."""

@@ -53,6 +53,29 @@ def test_colour_without_depth_is_counted_and_named(
     assert '2 of 6 colour images have no depth within 30 ms: rgb/15' in caplog.text
 
 
+def test_images_may_lie_elsewhere(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / 'walk', without_depth=(1,))
+    (folder / 'rgb').rename(tmp_path / 'images')
+    listed = (folder / 'rgb.txt').read_text()
+    (folder / 'rgb.txt').write_text(listed.replace(' rgb/', f' {tmp_path}/images/'))
+    sequence = open_sequence(folder)
+    assert len(sequence) == 5
+    assert sequence.unpaired_color == (f'{tmp_path}/images/1500000000.033333.png',)
+
+
+def test_stamps_of_depth_that_are_late_are_corrected(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / 'walk')
+    delays_ns = [frame.depth_delay_ns for frame in open_sequence(folder)]
+    listed = [line.split() for line in (folder / 'depth.txt').read_text().splitlines()]
+    late = [f'{float(stamp) + 0.7:.6f} {file}' for stamp, file in listed if stamp != '#']
+    (folder / 'depth.txt').write_text('\n'.join(late))
+    with pytest.raises(DatasetError, match='no two within 30 ms'):
+        open_sequence(folder)
+    frames = list(open_sequence(folder, depth_offset_s=0.7))
+    assert [frame.depth_delay_ns for frame in frames] == pytest.approx(delays_ns, abs=1000)
+    assert len(set(delays_ns)) == 1 and delays_ns[0] != 0
+
+
 def test_no_pair_at_all_is_an_error(tmp_path: Path) -> None:
     folder = write_tum(tmp_path / 'walk')
     with pytest.raises(DatasetError, match='6 colour and 6 depth images but no two within 5 ms'):
