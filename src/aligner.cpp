@@ -472,7 +472,7 @@ struct alignas(64) Block {
   float weight[kBlock], cost[kBlock];
   float abs_I[kBlock], abs_D[kBlock];  // |residual| of comparable pixels, -1 elsewhere
   float in_view[kBlock], reference[kBlock], compared[kBlock], inlier[kBlock];
-  float seen[kBlock], same[kBlock], depth[kBlock];
+  float seen[kBlock], depth[kBlock];
   int at[kBlock];  // pixel of the current image
 };
 
@@ -608,7 +608,6 @@ BDGS_INLINE void fill_block_body(const Points* points, int begin, int n, const L
     out.reference[i] = reference;
     out.in_view[i] = reference * seen;
     out.seen[i] = seen;
-    out.same[i] = same;
     out.depth[i] = z;
     out.at[i] = near;
   }
@@ -1015,7 +1014,7 @@ Solution run_alignment(Pyramid& reference, Pyramid& current,
 struct Cell {
   double H[6][6] = {}, g[6] = {};
   double cost = 0, weight = 0, depth = 0;
-  int seen = 0, gaps = 0;  // gaps: another surface is seen
+  int seen = 0;
 };
 
 std::vector<Cell> accumulate_cells(const Points& points, const Level& level, const State& state,
@@ -1039,7 +1038,6 @@ std::vector<Cell> accumulate_cells(const Points& points, const Level& level, con
       cell.weight += block.weight[i];
       cell.depth += block.depth[i];
       cell.seen += 1;
-      cell.gaps += block.same[i] <= 0;
     }
   }
   for (Cell& cell : cells) {
@@ -1312,7 +1310,7 @@ py::dict cells(Pyramid& reference, Pyramid& current, int reference_level, int cu
   }
   const int n = static_cast<int>(found.size());
   const int columns = (level.width + size - 1) / size;
-  py::array_t<double> H({n, 6, 6}), g({n, 6}), cost(n), weight(n), depth(n), seen(n), gaps(n);
+  py::array_t<double> H({n, 6, 6}), g({n, 6}), cost(n), weight(n), depth(n), seen(n);
   for (int k = 0; k < n; ++k) {
     const Cell& cell = found[k];
     std::copy_n(&cell.H[0][0], 36, H.mutable_data(k));
@@ -1321,7 +1319,6 @@ py::dict cells(Pyramid& reference, Pyramid& current, int reference_level, int cu
     weight.mutable_at(k) = cell.weight;
     depth.mutable_at(k) = cell.depth;
     seen.mutable_at(k) = cell.seen;
-    gaps.mutable_at(k) = cell.gaps;
   }
   py::dict out;
   out["information"] = H;
@@ -1330,7 +1327,6 @@ py::dict cells(Pyramid& reference, Pyramid& current, int reference_level, int cu
   out["weight"] = weight;
   out["depth_m"] = depth;
   out["seen"] = seen;
-  out["gaps"] = gaps;
   out["columns"] = columns;
   return out;
 }

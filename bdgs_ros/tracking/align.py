@@ -109,8 +109,6 @@ class Cells:
     depth_m: NDArray[np.float64]
     seen: NDArray[np.float64]
     """Points."""
-    gaps: NDArray[np.float64]
-    """Of them those where the image shows another surface."""
     columns: int
     plane: NDArray[np.float64]
     """Shape (C, 3): inverse depth of the image and its slope along u and v, per square; mean."""

@@ -469,7 +469,7 @@ def cells(
     cells : dict
         Of C squares of `size` pixels, row by row, `columns` of them in a row: `information`,
         shape (C, 6, 6), `gradient`, shape (C, 6), and of shape (C,) `cost`, `weight`, `depth_m`
-        (mean), `seen` (points) and `gaps` (points where another surface is seen).
+        (mean) and `seen` (points).
 
     """
     points, level = collect_points(reference, reference_level), current.level(current_level)
@@ -498,7 +498,6 @@ def cells(
         'weight': summed(weight * (1 + rows.has_depth)),
         'depth_m': summed(1.0 / rows.inverse_z) / np.maximum(seen, 1),
         'seen': seen,
-        'gaps': summed((~same).astype(float)),
         'columns': columns,
     }
 

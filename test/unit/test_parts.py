@@ -30,7 +30,6 @@ def cells(near: np.ndarray, near_step: np.ndarray, far_step: np.ndarray, seed: i
         weight=np.full(count, 30.0),
         depth_m=np.where(near.reshape(-1), 1.0, 4.0),
         seen=np.full(count, 16.0),
-        gaps=np.zeros(count),
         columns=COLUMNS,
         plane=np.zeros((count, 3)),
     )
