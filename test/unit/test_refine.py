@@ -54,7 +54,7 @@ def finished(tmp_path, monkeypatch) -> Path:
     """Return the folder of a run over `Recording`."""
     mapped().save(tmp_path / 'map.ply')
     write_trajectory(tmp_path / 'trajectory.txt', Recording().trajectory())
-    monkeypatch.setattr(layouts, 'open_sequence', lambda path, camera: Recording())
+    monkeypatch.setattr(layouts, 'open_sequence', lambda *_, **__: Recording())
     monkeypatch.setattr(job_module, 'open_truth', lambda path: None)
     return tmp_path
 
@@ -165,7 +165,7 @@ def test_nothing_left_to_test_with_is_said(finished, monkeypatch):
         finished / 'trajectory.txt',
         Trajectory(tuple(StampedPose(f.stamp_ns, np.eye(4)) for f in only)),
     )
-    monkeypatch.setattr(layouts, 'open_sequence', lambda path, camera: sequence)
+    monkeypatch.setattr(layouts, 'open_sequence', lambda *_, **__: sequence)
     with pytest.raises(EvaluationError, match=r'all 3 frames .* were keyframes'):
         refine_job(a_job(finished, recording=finished))
 

@@ -46,7 +46,7 @@ def finished(tmp_path, monkeypatch):
         stub = ModuleType(name)
         setattr(stub, attribute, fake)
         monkeypatch.setitem(sys.modules, name, stub)
-    monkeypatch.setattr(layouts, 'open_sequence', lambda path, camera: FakeSequence(12))
+    monkeypatch.setattr(layouts, 'open_sequence', lambda *_, **__: FakeSequence(12))
     monkeypatch.setattr(module, 'open_truth', lambda path: FakeTruth())
     slam = FakeSlam(lost=(3, 4))
     result = run_sequence(FakeSequence(12), slam)
