@@ -51,7 +51,8 @@ _log = logging.getLogger(__name__)
 _START_SIGMA = (0.3, 0.3)  # m and rad: how well the start in a known map is known
 _PLACE_SIGMA = (0.05, 0.03)  # of a pose from features
 _SPEED = (1.0, 2.0)  # m/s and rad/s, from one frame to the next that shall confirm it
-_LEAST_MOVED = 0.02  # of the view; less does not move the camera
+_LEAST_MOVED = 0.02  # of the view, that was not masked; less does not move the camera
+_LEAST_MOVED_HURRIED = 0.1  # the same while newer frames wait: to align again costs a third
 _MOST_TRACKED = 32  # keyframes; mapping that is further behind corrects nothing
 
 
@@ -94,7 +95,7 @@ class CameraTracker:
         self._motion.reset()
         self._movers.reset()
         self._broken.reset()
-        self._is_whole = True
+        self._is_whole, self._is_hurried = True, False
         self._choice.begin(None)
         self._places.clear()
 
@@ -243,6 +244,7 @@ class CameraTracker:
             With status LOST the pose is the prediction and must not be used.
 
         """
+        self._is_hurried = hurried
         prior = self._prior(frame, labels)
         missing = self._broken.share(frame.color)
         self._is_whole = missing == 0
@@ -360,8 +362,10 @@ class CameraTracker:
         if parts is not None:
             moved = parts.mask(prior.shape, self._config.movers.p_dynamic)
             p_moving = parts.large(prior, self._config.movers.p_dynamic)
+            least = _LEAST_MOVED_HURRIED if self._is_hurried else _LEAST_MOVED
+            is_known = parts.unnamed(prior).mean() <= least  # and had no say before
             prior = np.maximum(prior, moved)
-            if parts.is_other or parts.moved.mean() > _LEAST_MOVED:
+            if parts.is_other or not is_known:
                 coarse, current = self._align_world(start, current, prior, first, parts)
         p_dynamic = self._see_movers(prior, current, coarse)
         current = self._aligner.with_dynamic(current, p_dynamic, self._sweep(stamp_ns, coarse))

@@ -52,6 +52,12 @@ class Parts:
         """Return P(dynamic) x 255 of an image of this shape."""
         return _grown(self.moved, shape, p_dynamic)
 
+    def unnamed(self, prior: ProbabilityImage) -> Mask:
+        """Return which squares move that the prior does not call dynamic, [rows, columns]."""
+        size = (self.moved.shape[1], self.moved.shape[0])
+        is_named = cv2.resize(prior, size, interpolation=cv2.INTER_AREA) > DYNAMIC_THRESHOLD
+        return np.asarray(self.moved & ~is_named)
+
     def large(self, prior: ProbabilityImage, p_dynamic: float) -> ProbabilityImage | None:
         """
         Return the same of what is large, clearly moves, and is not in the prior; None for nothing.
@@ -59,9 +65,7 @@ class Parts:
         Keyframes go by this: what they call dynamic is no landmark and does not enter the map, so
         that single squares must not be called so.
         """
-        size = (self.moved.shape[1], self.moved.shape[0])
-        is_named = cv2.resize(prior, size, interpolation=cv2.INTER_AREA) > DYNAMIC_THRESHOLD
-        unnamed = (self.moved & ~is_named).astype(np.uint8)
+        unnamed = self.unnamed(prior).astype(np.uint8)
         count, label = cv2.connectedComponents(
             cv2.morphologyEx(unnamed, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
         )
@@ -147,7 +151,8 @@ def _what_moves(
     # A limb that swings past agrees with no motion; so do single squares of a blurred room.
     unlike, labels = asked & (cost > config.unlike), things(cells)
     moved |= unlike & _move_mostly(labels, moved | unlike, cells, config)[labels]
-    for whole in (_whole_planes, partial(_whole_things, cost=cost, scale=scale)):
+    whole_things = partial(_whole_things, labels=labels, cost=cost, scale=scale)
+    for whole in (_whole_planes, whole_things):
         grown = moved | (asked & whole(moved, cells, config))
         if area[~grown].sum() > _LEFT:
             moved = grown
@@ -168,14 +173,19 @@ def _move_mostly(labels: NDArray[np.intp], moved: Mask, cells: Cells, config: Pa
 
 
 def _whole_things(
-    moved: Mask, cells: Cells, config: PartsConfig, *, cost: Array, scale: Array
+    moved: Mask,
+    cells: Cells,
+    config: PartsConfig,
+    *,
+    labels: NDArray[np.intp],
+    cost: Array,
+    scale: Array,
 ) -> Mask:
     """
     Return the plain parts of things that move: a shirt without a pattern agrees with any motion.
 
     What agrees with the world's motion, and not as well with the thing's, stays the world.
     """
-    labels = things(cells)
     found = np.zeros_like(moved)
     for label in np.flatnonzero(_move_mostly(labels, moved, cells, config)):
         own = labels == label

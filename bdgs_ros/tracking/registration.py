@@ -117,7 +117,7 @@ class _Sample:
 
 class RegistrationWatch:
     """
-    Measures for some seconds, and again from time to time.
+    Measures for some seconds, again at once if that told little, and from time to time.
 
     Parameters
     ----------
@@ -172,6 +172,10 @@ class RegistrationWatch:
         late = self.found is not None and self.found.is_late(self._config)
         return self.found.depth_offset_s if self.found is not None and late else 0.0
 
+    def _is_clear(self) -> bool:
+        found = self.found
+        return found is not None and found.lag_sigma_s < self._config.lag_s
+
     def _collect(self, frame: RgbdFrame) -> None:
         self._width = frame.camera.width
         self._samples.append(_sample(frame))
@@ -184,8 +188,7 @@ class RegistrationWatch:
     def _begin(self) -> None:
         samples, self._samples = self._samples, []
         self._windows += 1
-        pause_s = self._config.pause_s if self._windows > 1 else 0.0
-        self._rests_until_ns = samples[-1].stamp_ns + round(1e9 * pause_s)
+        self._rests_until_ns = samples[-1].stamp_ns + round(1e9 * self._config.pause_s)
         enough = len(samples) >= self._config.least_frames
         self._work = _measured(samples, self._width) if enough else None
 
@@ -197,6 +200,8 @@ class RegistrationWatch:
         except StopIteration as end:
             self._work = None
             self.found = end.value or self.found
+            if self._windows == 1 and not self._is_clear():
+                self._rests_until_ns = 0
             if self.objection:
                 _log.warning('%s', self.objection)
 

@@ -238,7 +238,7 @@ class RegistrationConfig:
     frames: int = param(150, 'or by so many frames', low=30, high=1000)
     least_frames: int = param(20, 'fewer tell nothing', low=20, high=1000)
     pause_s: float = param(
-        60.0, 'between measurements after the second', unit='s', low=0.0, high=3600.0
+        60.0, 'between measurements once one was clear', unit='s', low=0.0, high=3600.0
     )
     steps: int = param(4, 'of the measurement in each frame, about a millisecond each', low=1)
     lag_s: float = param(
