@@ -47,7 +47,7 @@ def world(*arguments: object) -> Parts:
     return parts
 
 
-STEP = np.array([0.02, 0.0, 0.01, 0.0, 0.01, 0.0])
+STEP = np.array([0.05, 0.0, 0.025, 0.0, 0.025, 0.0])
 
 
 @pytest.mark.parametrize('share', [0.3, 0.55, 0.75])
@@ -141,7 +141,7 @@ def test_the_plain_parts_of_a_thing_move_with_it() -> None:
 
 def test_keyframes_go_by_what_is_large_and_unnamed() -> None:
     """A door over half of the view is no landmark; what a detector has named is known already."""
-    found = world(cells(left(0.5), 3 * STEP, RESTING), RESTING, SURE)
+    found = world(cells(left(0.5), 2 * STEP, RESTING), RESTING, SURE)
     prior = np.zeros((ROWS * 16, COLUMNS * 16), np.uint8)
     large = found.large(prior, 0.8)
     assert large is not None
@@ -150,6 +150,6 @@ def test_keyframes_go_by_what_is_large_and_unnamed() -> None:
     assert found.large(np.full_like(prior, 255), 0.8) is None
     small = np.zeros((ROWS, COLUMNS), bool)
     small[4:7, 4:8] = True
-    assert world(cells(small, 3 * STEP, RESTING), RESTING, SURE).large(prior, 0.8) is None
-    slow = world(cells(left(0.5), STEP, RESTING), RESTING, SURE)
+    assert world(cells(small, 2 * STEP, RESTING), RESTING, SURE).large(prior, 0.8) is None
+    slow = world(cells(left(0.5), 0.4 * STEP, RESTING), RESTING, SURE)
     assert slow.large(prior, 0.8) is None

@@ -131,8 +131,8 @@ class PartsConfig:
         20.0, 'how many independent surfaces there are to agree with a motion', low=0.0
     )
     surprise: float = param(8.0, 'most that an unexpected motion counts against a part', low=0.0)
-    margin: float = param(0.5, 'another part is so much more likely the world', low=0.0)
-    moved: float = param(1.5, 'a square moves on its own: residuals beyond its noise', low=0.0)
+    margin: float = param(2.0, 'another part is so much more likely the world', low=0.0)
+    moved: float = param(4.0, 'a square moves on its own: residuals beyond its noise', low=0.0)
     unlike: float = param(
         9.0, 'nor is a square the world whose residuals are so many times its noise', low=0.0
     )
