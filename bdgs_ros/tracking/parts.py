@@ -130,8 +130,9 @@ def find_world(
             likely = np.stack([_refined(cells, step, least, scale, asked) for step in likely])
         losses = loss(likely, _cost(cells, likely))
         step, is_other = likely[np.argmin(losses)], True
-    moved = _what_moves(cells, asked, step, least, scale, area, config)
-    excess = (_cost(cells, step[None])[0] - least) / scale
+    cost = _cost(cells, step[None])[0] / scale
+    excess = cost - least / scale
+    moved = _what_moves(cells, asked, cost, excess, scale, area, config)
     image = (-1, cells.columns)
     return Parts(step, moved.reshape(image), excess.reshape(image), cells, is_other)
 
@@ -139,15 +140,14 @@ def find_world(
 def _what_moves(
     cells: Cells,
     asked: Mask,
-    step: Array,
-    least: Array,
+    cost: Array,
+    excess: Array,
     scale: Array,
     area: Array,
     config: PartsConfig,
 ) -> Mask:
-    """Return the squares that are not the world, which moves by `step`."""
-    cost = _cost(cells, step[None])[0] / scale
-    moved: Mask = asked & (cost - least / scale > config.moved)
+    """Return the squares that are not the world, by their cost at its motion over their noise."""
+    moved: Mask = asked & (excess > config.moved)
     # A limb that swings past agrees with no motion; so do single squares of a blurred room.
     unlike, labels = asked & (cost > config.unlike), things(cells)
     moved |= unlike & _move_mostly(labels, moved | unlike, cells, config)[labels]
