@@ -26,7 +26,7 @@ def solved(rng: np.random.Generator, together: float) -> tuple[Cells, np.ndarray
     ones = np.ones(count)
     cells = Cells(
         information, gradient, (noise**2).sum(axis=1), POINTS * ones, ones, POINTS * ones,
-        0 * ones, COLUMNS, np.zeros((count, 3)),
+        COLUMNS, np.zeros((count, 3)),
     )  # fmt: skip
     return cells, error
 
