@@ -77,6 +77,7 @@ struct Params {
   double inlier_intensity = 0.08;
   double inlier_depth_sigma = 6.0;
   double min_static = 0.25;
+  double shade = 0.03;
   int max_points = 20000;
 };
 
@@ -1014,8 +1015,22 @@ Solution run_alignment(Pyramid& reference, Pyramid& current,
 struct Cell {
   double H[6][6] = {}, g[6] = {};
   double cost = 0, weight = 0, depth = 0;
+  double brightness[kColor] = {};  // its column of the normal equations, and its gradient
   int seen = 0;
 };
+
+constexpr int kBrightness = 7;  // the unknown of a square's own
+
+// Leave open how bright the square is: vignettes and shadows are no motion.
+void leave_brightness_open(Cell& cell, double shade) {
+  const double tie = 1.0 / (shade * shade);
+  const double own = cell.brightness[kBrightness] + tie, off = cell.brightness[6];
+  for (int a = 0; a < 6; ++a) {
+    for (int b = a; b < 6; ++b) cell.H[a][b] -= cell.brightness[a] * cell.brightness[b] / own;
+    cell.g[a] -= cell.brightness[a] * off / own;
+  }
+  cell.cost -= off * off / own;
+}
 
 std::vector<Cell> accumulate_cells(const Points& points, const Level& level, const State& state,
                                    const Params& params, int size) {
@@ -1033,7 +1048,10 @@ std::vector<Cell> accumulate_cells(const Points& points, const Level& level, con
         const double color = block.JI[a][i], depth = block.JD[a][i];
         for (int b = a; b < 6; ++b) cell.H[a][b] += color * block.JI[b][i] + depth * block.JD[b][i];
         cell.g[a] += color * block.JI[kColor][i] + depth * block.JD[kDepth][i];
+        cell.brightness[a] += color * block.JI[kBrightness][i];
       }
+      cell.brightness[6] += block.JI[kBrightness][i] * block.JI[kColor][i];
+      cell.brightness[kBrightness] += block.JI[kBrightness][i] * block.JI[kBrightness][i];
       cell.cost += block.cost[i];
       cell.weight += block.weight[i];
       cell.depth += block.depth[i];
@@ -1042,6 +1060,7 @@ std::vector<Cell> accumulate_cells(const Points& points, const Level& level, con
   }
   for (Cell& cell : cells) {
     cell.depth /= std::max(cell.seen, 1);
+    leave_brightness_open(cell, params.shade);
     for (int a = 0; a < 6; ++a)
       for (int b = 0; b < a; ++b) cell.H[a][b] = cell.H[b][a];
   }
@@ -1294,13 +1313,14 @@ py::dict align(Pyramid& reference, Pyramid& current,
 }
 
 py::dict cells(Pyramid& reference, Pyramid& current, int reference_level, int current_level,
-               const Array& T, double gain, double bias, int size, const Params& params) {
+               const Array& T, double gain, double bias,
+               const std::array<double, kPattern>& pattern, int size, const Params& params) {
   Params equal = params;  // depth weighs as its noise says
   equal.depth_weight = 1.0;
   const Scales scales{static_cast<float>(params.intensity_noise),
                       static_cast<float>(params.depth_noise)};
-  State state = state_of(matrix_of(T, "T_current_reference"), appearance_of(gain, bias, {0, 0, 0}),
-                         scales, current.sweep);
+  State state = state_of(matrix_of(T, "T_current_reference"),
+                         appearance_of(gain, bias, pattern), scales, current.sweep);
   state.least_static = 1.0f;
   const Level& level = current.levels.at(current_level);
   std::vector<Cell> found;
@@ -1363,6 +1383,7 @@ PYBIND11_MODULE(_aligner, m) {
       .def_readwrite("pixel_noise", &Params::pixel_noise)
       .def_readwrite("depth_noise", &Params::depth_noise)
       .def_readwrite("depth_weight", &Params::depth_weight)
+      .def_readwrite("shade", &Params::shade)
       .def_readwrite("pattern_information", &Params::pattern_information)
       .def_readwrite("inlier_intensity", &Params::inlier_intensity)
       .def_readwrite("inlier_depth_sigma", &Params::inlier_depth_sigma)

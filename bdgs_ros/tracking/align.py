@@ -334,6 +334,7 @@ class Aligner:
             np.ascontiguousarray(result.T_current_reference, dtype=np.float64),
             result.gain,
             result.bias,
+            result.depth_pattern,
             CELL,
             self._params,
         )
@@ -415,6 +416,7 @@ def _make_params(config: AlignConfig, backend: ModuleType) -> Any:
         'inlier_intensity',
         'inlier_depth_sigma',
         'min_static',
+        'shade',
         'max_points',
     ):
         setattr(params, name, getattr(config, name))

