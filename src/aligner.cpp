@@ -432,7 +432,7 @@ const Points& points_of(Pyramid& pyramid, int index) {
 
 constexpr int kBlock = 256;
 constexpr int kPattern = 3;                  // xx, yy, xy: error of inverse depth over the image
-constexpr int kColor = 8, kDepth = 6 + kPattern;
+constexpr int kBias = 7, kColor = 8, kDepth = 6 + kPattern;
 constexpr int kUnknowns = kColor + kPattern;  // rho, phi, gain, bias, pattern
 
 using Appearance = std::array<double, 2 + kPattern>;  // gain, bias, pattern
@@ -1015,21 +1015,18 @@ Solution run_alignment(Pyramid& reference, Pyramid& current,
 struct Cell {
   double H[6][6] = {}, g[6] = {};
   double cost = 0, weight = 0, depth = 0;
-  double brightness[kColor] = {};  // its column of the normal equations, and its gradient
+  double mixed[6] = {}, own = 0, off = 0;  // the square's brightness in H, and in g
   int seen = 0;
 };
 
-constexpr int kBrightness = 7;  // the unknown of a square's own
-
 // Leave open how bright the square is: vignettes and shadows are no motion.
 void leave_brightness_open(Cell& cell, double shade) {
-  const double tie = 1.0 / (shade * shade);
-  const double own = cell.brightness[kBrightness] + tie, off = cell.brightness[6];
+  const double own = cell.own + 1.0 / (shade * shade);
   for (int a = 0; a < 6; ++a) {
-    for (int b = a; b < 6; ++b) cell.H[a][b] -= cell.brightness[a] * cell.brightness[b] / own;
-    cell.g[a] -= cell.brightness[a] * off / own;
+    for (int b = a; b < 6; ++b) cell.H[a][b] -= cell.mixed[a] * cell.mixed[b] / own;
+    cell.g[a] -= cell.mixed[a] * cell.off / own;
   }
-  cell.cost -= off * off / own;
+  cell.cost -= cell.off * cell.off / own;
 }
 
 std::vector<Cell> accumulate_cells(const Points& points, const Level& level, const State& state,
@@ -1042,16 +1039,17 @@ std::vector<Cell> accumulate_cells(const Points& points, const Level& level, con
     fill_block(&points, begin, n, &level, &state, &params, &block);
     for (int i = 0; i < n; ++i) {
       if (block.seen[i] <= 0) continue;
+      const double shade = block.JI[kBias][i];
       const int u = block.at[i] % level.width, v = block.at[i] / level.width;
       Cell& cell = cells[static_cast<size_t>(v / size) * columns + u / size];
       for (int a = 0; a < 6; ++a) {
         const double color = block.JI[a][i], depth = block.JD[a][i];
         for (int b = a; b < 6; ++b) cell.H[a][b] += color * block.JI[b][i] + depth * block.JD[b][i];
         cell.g[a] += color * block.JI[kColor][i] + depth * block.JD[kDepth][i];
-        cell.brightness[a] += color * block.JI[kBrightness][i];
+        cell.mixed[a] += color * shade;
       }
-      cell.brightness[6] += block.JI[kBrightness][i] * block.JI[kColor][i];
-      cell.brightness[kBrightness] += block.JI[kBrightness][i] * block.JI[kBrightness][i];
+      cell.off += shade * block.JI[kColor][i];
+      cell.own += shade * shade;
       cell.cost += block.cost[i];
       cell.weight += block.weight[i];
       cell.depth += block.depth[i];

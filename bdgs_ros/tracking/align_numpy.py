@@ -464,7 +464,8 @@ def cells(
     """
     Return what each square of the current image says of the motion, on its own.
 
-    All that is seen counts, also what is masked, and by the least noise.
+    All that is seen counts, also what is masked, and by the least noise. How bright a square is
+    stays open within `shade`: vignettes and shadows are no motion.
 
     Returns
     -------
@@ -481,9 +482,9 @@ def cells(
     var_I, var_D, squared = _normalised(rows, scales, params)
     same = _same_surface(rows, scales)
     weight = rows.seen * _robust(rows, squared, same, params)
-    J_I = rows.J_I[:, :6] * np.sqrt(weight / var_I)[:, None]
-    J_D = rows.J_D[:, :6] * np.sqrt(weight * rows.has_depth / var_D)[:, None]
     brightness = np.sqrt(weight / var_I)
+    J_I = rows.J_I[:, :6] * brightness[:, None]
+    J_D = rows.J_D[:, :6] * np.sqrt(weight * rows.has_depth / var_D)[:, None]
     e_I, e_D = rows.grey * brightness, rows.depth * np.sqrt(weight / var_D)
     columns, lines = -(-level.width // size), -(-level.height // size)
     index = rows.at[:, 1] // size * columns + rows.at[:, 0] // size
@@ -494,10 +495,9 @@ def cells(
         return out
 
     seen = summed(np.ones(len(index)))
-    # Leave open how bright each square is: vignettes and shadows are no motion.
-    mixed, off = summed(J_I * brightness[:, None]), summed(e_I * brightness)
-    own = summed(brightness**2) + params.shade**-2
-    mixed, off = mixed / np.sqrt(own)[:, None], off / np.sqrt(own)
+    root = np.sqrt(summed(brightness**2) + params.shade**-2)
+    mixed = summed(J_I * brightness[:, None]) / root[:, None]
+    off = summed(e_I * brightness) / root
     information = summed(J_I[:, :, None] * J_I[:, None] + J_D[:, :, None] * J_D[:, None])
     return {
         'information': information - mixed[:, :, None] * mixed[:, None],
