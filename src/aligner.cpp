@@ -883,10 +883,11 @@ State state_of(const Matrix4& T, const Appearance& appearance, const Scales& sca
   return s;
 }
 
-constexpr int kFewer = 5000;    // points are enough to tell how much the images agree,
-constexpr int kEnough = 20000;  // if not much less of the image is to be compared
+constexpr int kFewer = 5000;    // points are enough on coarser levels, and to tell in the end how
+constexpr int kEnough = 20000;  // well images agree, if not much less of them is to be compared
 constexpr double kDoubt = 1.1;  // noise of two images agrees by chance, a little
 
+// What both images say of the motion.
 struct Agreement {
   double H[kUnknowns][kUnknowns] = {};
   double texture = 0;  // 1: gradients of grey are the same, 0: they have nothing in common
@@ -912,21 +913,29 @@ Scales scales_of(Samples& samples, const Params& params) {
   return scales;
 }
 
-// What both images say of the motion: gradients that only one of them has, as noise has, cancel.
-Agreement agreement_of(const Points& points, const Level& level, State state, Params params,
-                       int compared) {
-  if (compared > kEnough) params.max_points = std::min(params.max_points, kFewer);
-  Samples unused;
+Params with_fewer(Params params) {
+  params.max_points = std::min(params.max_points, kFewer);
+  return params;
+}
+
+// Compare the images once more where they were found to lie. Gradients that only one of them has,
+// as noise has, cancel in what both say.
+void judge(const Points& points, const Level& level, State state, const Params& asked,
+           Solution& out) {
+  const Params params = out.totals.compared > kEnough ? with_fewer(asked) : asked;
+  Samples seen, unused;
   state.mixture = kMean;
-  const Totals mean = accumulate(points, level, state, params, unused);
+  out.totals = accumulate(points, level, state, params, seen);
+  out.median_I = Samples::median(seen.I);
+  out.median_D = Samples::median(seen.D);
   state.mixture = kHalf;
   const Totals half = accumulate(points, level, state, params, unused);
-  Agreement out;
+  const double both = out.totals.texture, one = half.texture;
   for (int i = 0; i < kUnknowns; ++i)
     for (int j = 0; j < kUnknowns; ++j)
-      out.H[i][j] = mean.H[i][j] - (i < 6 && j < 6 ? kDoubt * half.H[i][j] : 0.0);
-  out.texture = (mean.texture - half.texture) / std::max(mean.texture + half.texture, 1e-12);
-  return out;
+      out.agreement.H[i][j] =
+          out.totals.H[i][j] - (i < 6 && j < 6 ? kDoubt * half.H[i][j] : 0.0);
+  out.agreement.texture = (both - one) / std::max(both + one, 1e-12);
 }
 
 constexpr double kOverRelaxation = 1.3;  // reweighting and gradient noise make steps too short
@@ -971,15 +980,16 @@ constexpr double kCoarseStop = 2.0;     // coarser levels stop at larger steps
 
 Solution run_alignment(Pyramid& reference, Pyramid& current,
                        const std::vector<std::pair<int, int>>& pairs, const Matrix4& T_init,
-                       const Prior& prior, const Params& params) {
+                       const Prior& prior, const Params& asked) {
   Solution out;
   out.T = T_init;
   Scales scales;
-  int left = params.max_iterations;
+  int left = asked.max_iterations;
   for (size_t k = 0; k < pairs.size(); ++k) {
     const Points& points = points_of(reference, pairs[k].first);
     const Level& target = current.levels[pairs[k].second];
     const int finer = static_cast<int>(pairs.size() - k - 1);
+    const Params params = finer > 0 ? with_fewer(asked) : asked;
     const int budget = std::min(left, std::max(2, left - kReserved * finer));
     const double stop = params.stop_px * (finer > 0 ? kCoarseStop : 1.0);
     Samples samples;
@@ -988,24 +998,17 @@ Solution run_alignment(Pyramid& reference, Pyramid& current,
     out.converged = false;
     for (int i = 0; i < budget && !out.converged; ++i, --left) {
       Samples seen;
-      const Totals totals =
-          accumulate(points, target, state_of(out.T, out.appearance, scales, current.sweep),
-                     params, seen);
-      const double size = step(totals, prior, params, target.fx, out.T, out.appearance);
+      out.totals = accumulate(points, target,
+                              state_of(out.T, out.appearance, scales, current.sweep), params, seen);
+      const double size = step(out.totals, prior, params, target.fx, out.T, out.appearance);
       if (size < 0) break;
       ++out.iterations;
       scales = scales_of(seen, params);
       out.converged = size < stop;
     }
   }
-  Samples samples;
-  const Points& points = points_of(reference, pairs.back().first);
-  const Level& finest = current.levels[pairs.back().second];
-  const State state = state_of(out.T, out.appearance, scales, current.sweep);
-  out.totals = accumulate(points, finest, state, params, samples);
-  out.agreement = agreement_of(points, finest, state, params, out.totals.compared);
-  out.median_I = Samples::median(samples.I);
-  out.median_D = Samples::median(samples.D);
+  judge(points_of(reference, pairs.back().first), current.levels[pairs.back().second],
+        state_of(out.T, out.appearance, scales, current.sweep), asked, out);
   return out;
 }
 
@@ -1247,8 +1250,6 @@ py::array_t<T> plane_array(const std::vector<T>& plane, int height, int width) {
 
 py::dict totals_dict(const Totals& totals, float median_I, float median_D) {
   py::dict out;
-  out["information"] = py::array_t<double>({kUnknowns, kUnknowns}, &totals.H[0][0]);
-  out["gradient"] = py::array_t<double>(kUnknowns, totals.g);
   out["cost"] = totals.cost;
   out["weight"] = totals.weight;
   out["compared"] = totals.compared;
@@ -1277,7 +1278,10 @@ py::dict normal_equations(Pyramid& reference, Pyramid& current, int reference_le
   Samples samples;
   const Totals totals = accumulate(points_of(reference, reference_level),
                                    current.levels.at(current_level), state, params, samples);
-  return totals_dict(totals, Samples::median(samples.I), Samples::median(samples.D));
+  py::dict out = totals_dict(totals, Samples::median(samples.I), Samples::median(samples.D));
+  out["information"] = py::array_t<double>({kUnknowns, kUnknowns}, &totals.H[0][0]);
+  out["gradient"] = py::array_t<double>(kUnknowns, totals.g);
+  return out;
 }
 
 py::dict align(Pyramid& reference, Pyramid& current,

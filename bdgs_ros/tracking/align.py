@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
+from functools import cached_property
 from importlib import import_module
 from types import ModuleType
 from typing import Any
@@ -49,8 +50,11 @@ class ImagePyramid:
     handle: Any
     camera: PinholeCamera
     widths: tuple[int, ...]
-    depth_m: float
-    """Median; 1 where there is none."""
+
+    @cached_property
+    def depth_m(self) -> float:
+        """Median; 1 where there is none. Only references are asked."""
+        return _median_depth(self.handle.level(len(self.widths) - 1))
 
 
 @dataclass(frozen=True)
@@ -195,7 +199,7 @@ class Aligner:
             _AT_REST if sweep is None else sweep,
         )
         widths = tuple(handle.level(i).width for i in range(count))
-        return ImagePyramid(handle, camera, widths, _median_depth(handle.level(count - 1)))
+        return ImagePyramid(handle, camera, widths)
 
     def with_dynamic(
         self,
@@ -455,16 +459,12 @@ def _levels(width: int, config: AlignConfig) -> tuple[int, int]:
 def _planes(level: Any) -> NDArray[np.float64]:
     """Return inverse depth and its slopes of each square, 0 where none of it is one surface."""
     rows, columns = -(-level.height // CELL), -(-level.width // CELL)
-    padding = ((0, rows * CELL - level.height), (0, columns * CELL - level.width))
-    squares = np.stack(
-        [
-            np.pad(plane, padding).reshape(rows, CELL, columns, CELL).swapaxes(1, 2)
-            for plane in (level.smooth, level.dx * CELL, level.dy * CELL)
-        ],
-        axis=-1,
-    ).reshape(rows * columns, CELL * CELL, 3)
-    count = (squares[..., 0] > 0).sum(axis=1, keepdims=True)
-    return np.asarray(squares.sum(axis=1) / np.maximum(count, 1), np.float64)
+    images = np.zeros((4, rows * CELL, columns * CELL), np.float32)
+    seen = images[:, : level.height, : level.width]
+    seen[:] = level.smooth > 0, level.smooth, level.dx, level.dy
+    seen[2:] *= CELL
+    count, *sums = images.reshape(4, rows, CELL, columns, CELL).sum(axis=(2, 4)).reshape(4, -1)
+    return np.asarray(np.stack(sums, axis=1) / np.maximum(count, 1)[:, None], np.float64)
 
 
 def _median_depth(level: Any) -> float:

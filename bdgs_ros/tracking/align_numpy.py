@@ -65,8 +65,8 @@ _BRIGHTNESS_TIE = 1e-3  # share of the pixels that say gain 1 and bias 0
 _SURFACE_SHARE, _SURFACE_SCALES = 0.03, 4.0  # inverse depth may differ by share and scales
 _RESERVED = 4  # iterations kept for every finer level
 _COARSE_STOP = 2.0  # coarser levels stop at larger steps
-_FEWER = 5000  # points are enough to tell how much the images agree,
-_ENOUGH = 20000  # if not much less of the image is to be compared
+_FEWER = 5000  # points are enough on coarser levels, and to tell in the end how well images agree,
+_ENOUGH = 20000  # if not much less of them is to be compared
 _DOUBT = 1.1  # noise of two images agrees by chance, a little
 
 
@@ -414,7 +414,7 @@ def normal_equations(
     return _totals(points, share, rows, Scales(intensity_scale, inverse_depth_scale), params)
 
 
-def _agreement(
+def _judged(
     points: Points,
     share: float,
     level: Level,
@@ -425,13 +425,14 @@ def _agreement(
     params: Params,
 ) -> dict[str, Any]:
     """
-    Return what both images say of the motion: `agreed`, shape (11, 11), and `texture`.
+    Compare the images once more where they were found to lie.
 
-    With gradients a and b of the two, `a b' + b a'` is twice the product of their mean with
-    itself less that of half their difference. What only one of them has, as noise has, is in
-    neither sum: a plain wall tells nothing, however many of its pixels are noisy. `texture` is
-    the correlation of the gradients of grey: 1 where they are the same, 0 where the images have
-    nothing in common.
+    Beside counts and medians it says what both images tell of the motion: `agreed`, shape
+    (11, 11), and `texture`. With gradients a and b of the two, `a b' + b a'` is twice the product
+    of their mean with itself less that of half their difference. What only one of them has, as
+    noise has, is in neither sum: a plain wall tells nothing, however many of its pixels are
+    noisy. `texture` is the correlation of the gradients of grey: 1 where they are the same, 0
+    where the images have nothing in common.
     """
     mean, half = (
         _totals(
@@ -443,10 +444,10 @@ def _agreement(
         )
         for mixture in (MEAN, HALF)
     )
-    agreed = mean['information'].copy()
+    agreed = mean.pop('information')
     agreed[:6, :6] -= _DOUBT * half['information'][:6, :6]
     both, one = mean['texture'], half['texture']
-    return {'agreed': agreed, 'texture': (both - one) / max(both + one, 1e-12)}
+    return {**mean, 'agreed': agreed, 'texture': (both - one) / max(both + one, 1e-12)}
 
 
 def cells(
@@ -552,40 +553,35 @@ def align(
     Returns
     -------
     result : dict
-        `T`, `gain`, `bias`, `pattern`, `iterations`, `converged`, and the sums of the finest
-        level at the last pose.
+        `T`, `gain`, `bias`, `pattern`, `iterations`, `converged`, and how well the images agree
+        on the finest level.
 
     """
     T, appearance = T_init.copy(), Appearance()
     prior = None if T_prior is None or information is None else (T_prior, information)
+    fewer = replace(params, max_points=min(params.max_points, _FEWER))
     left, done, converged, scales = params.max_iterations, 0, False, Scales()
     for index, (i, j) in enumerate(pairs):
-        points, share = spread(collect_points(reference, i), params)
-        level = current.level(j)
         finer = len(pairs) - index - 1
+        points, share = spread(collect_points(reference, i), fewer if finer else params)
+        level = current.level(j)
         budget = min(left, max(2, left - _RESERVED * finer))
         stop = params.stop_px * (_COARSE_STOP if finer else 1.0)
         scales = _scales(linearise(points, level, T, current.sweep, appearance), params)
         converged = False
         while budget > 0 and not converged:
             rows = linearise(points, level, T, current.sweep, appearance)
-            step = _step(
-                _totals(points, share, rows, scales, params), T, appearance, prior, params
-            )
+            totals = _totals(points, share, rows, scales, params)
+            step = _step(totals, T, appearance, prior, params)
             T = se3.orthonormalise(se3.exp(step[:6]) @ T)
             appearance = Appearance(appearance.values + step[6:])
             scales = _scales(rows, params)
             converged = _step_px(step, level) < stop
             budget, left, done = budget - 1, left - 1, done + 1
-    totals = _totals(
-        points, share, linearise(points, level, T, current.sweep, appearance), scales, params
-    )
     if totals['compared'] > _ENOUGH:
-        fewer = replace(params, max_points=min(params.max_points, _FEWER))
         points, share = spread(collect_points(reference, i), fewer)
     return {
-        **totals,
-        **_agreement(points, share, level, T, current.sweep, appearance, scales, params),
+        **_judged(points, share, level, T, current.sweep, appearance, scales, params),
         'T': T,
         'gain': float(appearance.values[0]),
         'bias': float(appearance.values[1]),

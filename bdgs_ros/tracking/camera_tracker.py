@@ -361,9 +361,10 @@ class CameraTracker:
         p_moving = None
         if parts is not None:
             moved = parts.mask(prior.shape, self._config.movers.p_dynamic)
-            p_moving = parts.large(prior, self._config.movers.p_dynamic)
+            unnamed = parts.unnamed(prior)
+            p_moving = parts.large(unnamed, prior.shape, self._config.movers.p_dynamic)
             least = _LEAST_MOVED_HURRIED if self._is_hurried else _LEAST_MOVED
-            is_known = parts.unnamed(prior).mean() <= least  # and had no say before
+            is_known = unnamed.mean() <= least  # and had no say before
             prior = np.maximum(prior, moved)
             if parts.is_other or not is_known:
                 coarse, current = self._align_world(start, current, prior, first, parts)
@@ -471,8 +472,9 @@ class CameraTracker:
         """Believe a pose; where the camera was lost, only one that is sure or seen twice."""
         start, estimate = attempt.start, attempt.best
         was_lost = self._is_lost or start.is_far
-        is_sure = start.confirms or self._is_expected(frame, attempt)
-        if was_lost and not (is_sure and self._can_be_keyframe(frame, attempt)):
+        if was_lost and not (
+            self._is_sure(frame, attempt) and self._can_be_keyframe(frame, attempt)
+        ):
             self._hypothesis = Hypothesis(frame.stamp_ns, estimate.T_world_camera, start)
             return self._lost(frame, attempt)
         if was_lost:
@@ -492,8 +494,10 @@ class CameraTracker:
             )
         return _result(frame, attempt, TrackingStatus.OK, is_keyframe, spread)
 
-    def _is_expected(self, frame: RgbdFrame, attempt: Attempt) -> bool:
-        """Tell whether the camera was lost just now, and is where it was about to go."""
+    def _is_sure(self, frame: RgbdFrame, attempt: Attempt) -> bool:
+        """Tell whether a frame before said the same: the camera is where it was about to go."""
+        if attempt.start.confirms:
+            return True
         if attempt.start.is_far or self._keyframe is None:
             return False
         best = attempt.best

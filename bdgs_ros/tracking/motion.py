@@ -10,7 +10,7 @@ zero after every update, when it is folded into the pose.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
@@ -43,6 +43,10 @@ class _State:
     """Shape (6,): (v, w) in the camera's frame, m/s and rad/s."""
     covariance: Matrix
     """Shape (12, 12): of (xi, nu)."""
+    unrest: float = 1.0
+    """How often the variance of the acceleration is that of the configuration."""
+    lag: Matrix = field(default_factory=lambda: np.zeros(6))
+    """How far predictions were off lately, mean, in standard deviations."""
 
 
 class MotionPredictor:
@@ -60,7 +64,6 @@ class MotionPredictor:
         self._config = config
         self._state: _State | None = None
         self._last: tuple[_State, _State] | None = None  # a state and where it was moved to
-        self._unrest, self._lag = 1.0, np.zeros(6)
         self._depth_m = _USUAL_DEPTH_M
 
     def look(self, depth_m: float) -> None:
@@ -76,7 +79,6 @@ class MotionPredictor:
     def reset(self) -> None:
         """Forget pose and velocity."""
         self._state = None
-        self._unrest, self._lag = 1.0, np.zeros(6)
 
     def predict(self, stamp_ns: int) -> tuple[Pose, Matrix]:
         """
@@ -112,10 +114,7 @@ class MotionPredictor:
 
     def velocity_with(self, stamp_ns: int, T_world_camera: Pose, covariance: Matrix) -> Matrix:
         """Return what the velocity would be after an update; changes nothing."""
-        kept = self._state
-        self.update(stamp_ns, T_world_camera, covariance)
-        velocity, self._state = self.velocity, kept
-        return velocity
+        return self._after(stamp_ns, T_world_camera, covariance).velocity
 
     def update(self, stamp_ns: int, T_world_camera: Pose, covariance: Matrix) -> None:
         """
@@ -136,40 +135,20 @@ class MotionPredictor:
             If the stamp is not later than the last one.
 
         """
+        self._state = self._after(stamp_ns, T_world_camera, covariance)
+
+    def _after(self, stamp_ns: int, T_world_camera: Pose, covariance: Matrix) -> _State:
         measured = se3.orthonormalise(T_world_camera)
         noise = covariance + _LEAST_VARIANCE * np.eye(6)
         if self._state is None:
-            self._state = self._start(stamp_ns, measured, noise)
-            return
+            return self._start(stamp_ns, measured, noise)
         predicted = self._propagate(self._state, stamp_ns)
         if self._config.model == 'velocity':
-            self._state = self._difference(self._state, stamp_ns, measured, noise)
-            return
+            return self._difference(self._state, stamp_ns, measured, noise)
         innovation = se3.log(se3.inverse(predicted.T_world_camera) @ measured)
         if self._is_outside(innovation, predicted.covariance[:6, :6] + noise):
-            self.reset()
-            self._state = self._start(stamp_ns, measured, noise)
-            return
-        self._note_surprise(innovation, predicted.covariance[:6, :6], noise)
-        self._state = self._correct(predicted, innovation, noise)
-
-    def _note_surprise(self, pulled: Matrix, predicted: Matrix, noise: Matrix) -> None:
-        """
-        Expect more of a camera that accelerates more than expected: by scale or by temper.
-
-        The measured pose was pulled towards the prediction, with their covariances P and R. The
-        images alone would have put it `(P + R) P^-1` times as far off. Single frames may be noise;
-        what lags behind for some frames in one direction is not.
-        """
-        both = predicted + noise
-        off = both @ np.linalg.solve(predicted, pulled)
-        white = np.linalg.solve(np.linalg.cholesky(both), off)
-        self._lag += _LAG_GAIN * (white - self._lag)
-        surprise = float((self._lag**2).max()) / _LAG_VARIANCE
-        if surprise > _SURPRISING:
-            self._unrest = min(self._unrest * _FASTER, _MOST_UNREST)
-        else:
-            self._unrest = max(self._unrest * _CALMER, 1.0)
+            return self._start(stamp_ns, measured, noise)
+        return self._correct(_surprised(predicted, innovation, noise), innovation, noise)
 
     def expects(self, stamp_ns: int, T_world_camera: Pose, covariance: Matrix) -> bool:
         """Tell whether the camera was seen lately, and a measured pose is where it may be now."""
@@ -217,9 +196,9 @@ class MotionPredictor:
         F = np.eye(12)
         F[:6, :6] = se3.adjoint(se3.inverse(step))
         F[:6, 6:] = dt * np.eye(6)
-        covariance = F @ state.covariance @ F.T + self._process_noise(dt)
+        covariance = F @ state.covariance @ F.T + state.unrest * self._process_noise(dt)
         pose = se3.orthonormalise(state.T_world_camera @ step)
-        return _State(stamp_ns, pose, state.velocity, covariance)
+        return replace(state, stamp_ns=stamp_ns, T_world_camera=pose, covariance=covariance)
 
     def _process_noise(self, dt: float) -> Matrix:
         """Return the noise of an acceleration that is constant over the step but unknown."""
@@ -227,7 +206,7 @@ class MotionPredictor:
         angular = self._config.angular_acceleration_sigma
         push = np.vstack([0.5 * dt**2 * np.eye(6), dt * np.eye(6)])
         accelerations = np.diag([linear**2] * 3 + [angular**2] * 3)
-        return np.asarray(self._unrest * push @ accelerations @ push.T)
+        return np.asarray(push @ accelerations @ push.T)
 
     def _difference(self, last: _State, stamp_ns: int, measured: Pose, noise: Matrix) -> _State:
         """
@@ -268,4 +247,21 @@ class MotionPredictor:
         pose = se3.orthonormalise(predicted.T_world_camera @ se3.exp(kalman.x[:6]))
         velocity = kalman.x[6:] if self._config.model == 'kalman' else np.zeros(6)
         covariance = 0.5 * (kalman.P + kalman.P.T)
-        return _State(predicted.stamp_ns, pose, velocity, covariance)
+        return replace(predicted, T_world_camera=pose, velocity=velocity, covariance=covariance)
+
+
+def _surprised(predicted: _State, pulled: Matrix, noise: Matrix) -> _State:
+    """
+    Expect more of a camera that accelerates more than expected: by scale or by temper.
+
+    The measured pose was pulled towards the prediction, with their covariances P and R. The
+    images alone would have put it `(P + R) P^-1` times as far off. Single frames may be noise;
+    what lags behind for some frames in one direction is not.
+    """
+    both = predicted.covariance[:6, :6] + noise
+    off = both @ np.linalg.solve(predicted.covariance[:6, :6], pulled)
+    white = np.linalg.solve(np.linalg.cholesky(both), off)
+    lag = predicted.lag + _LAG_GAIN * (white - predicted.lag)
+    is_more = float((lag**2).max()) / _LAG_VARIANCE > _SURPRISING
+    unrest = predicted.unrest * (_FASTER if is_more else _CALMER)
+    return replace(predicted, lag=lag, unrest=float(np.clip(unrest, 1.0, _MOST_UNREST)))

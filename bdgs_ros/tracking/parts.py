@@ -31,6 +31,7 @@ _LIKELY, _ROUNDS = 4, 3  # motions that are refined, and how often
 _LOOSE = np.diag([0.1**-2] * 3 + [0.1**-2] * 3)  # m and rad: a proposal stays in the linear range
 _LEFT = 0.25  # of the surface has to remain
 _LARGE, _CLEARLY = 0.15, 8.0  # share of the view, and excess: for keyframes to go by
+_STRIDE = 4  # pixels; a share needs no more
 _LEAST_NOISE = 0.3  # residuals over those of the sensor
 
 
@@ -55,25 +56,28 @@ class Parts:
     def unnamed(self, prior: ProbabilityImage) -> Mask:
         """Return which squares move that the prior does not call dynamic, [rows, columns]."""
         size = (self.moved.shape[1], self.moved.shape[0])
-        is_named = cv2.resize(prior, size, interpolation=cv2.INTER_AREA) > DYNAMIC_THRESHOLD
+        some = np.ascontiguousarray(prior[::_STRIDE, ::_STRIDE])
+        is_named = cv2.resize(some, size, interpolation=cv2.INTER_AREA) > DYNAMIC_THRESHOLD
         return np.asarray(self.moved & ~is_named)
 
-    def large(self, prior: ProbabilityImage, p_dynamic: float) -> ProbabilityImage | None:
+    def large(
+        self, unnamed: Mask, shape: tuple[int, int], p_dynamic: float
+    ) -> ProbabilityImage | None:
         """
-        Return the same of what is large, clearly moves, and is not in the prior; None for nothing.
+        Return an image of what is large and clearly moves of the unnamed; None for nothing.
 
         Keyframes go by this: what they call dynamic is no landmark and does not enter the map, so
         that single squares must not be called so.
         """
-        unnamed = self.unnamed(prior).astype(np.uint8)
-        count, label = cv2.connectedComponents(
-            cv2.morphologyEx(unnamed, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+        solid = cv2.morphologyEx(
+            unnamed.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)
         )
+        count, label = cv2.connectedComponents(solid)
         large = np.zeros_like(self.moved)
         for i in range(1, count):
             own = label == i
             large |= own & (own.mean() > _LARGE and np.median(self.excess[own]) > _CLEARLY)
-        return _grown(large, prior.shape, p_dynamic) if large.any() else None
+        return _grown(large, shape, p_dynamic) if large.any() else None
 
 
 def _grown(squares: Mask, shape: tuple[int, int], p_dynamic: float) -> ProbabilityImage:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from bdgs_ros.tracking.align import Cells
 
@@ -26,15 +25,15 @@ def things(cells: Cells) -> Index:
 
 
 def _connected(cells: Cells, bend: float) -> Index:
+    """Label an image of the squares with what is between them: there neighbours hang together."""
     plane = cells.plane.reshape(-1, cells.columns, 3)
-    index = np.arange(len(cells.plane)).reshape(plane.shape[:2])
-    columns = _goes_on(plane[:, :-1], plane[:, 1:], 1, bend)
-    rows = _goes_on(plane[:-1], plane[1:], 2, bend)
-    first = np.concatenate([index[:, :-1][columns], index[:-1][rows]])
-    second = np.concatenate([index[:, 1:][columns], index[1:][rows]])
-    count = len(cells.plane)
-    graph = coo_array((np.ones(len(first)), (first, second)), shape=(count, count))
-    return np.asarray(connected_components(graph, directed=False)[1], np.intp)
+    rows, columns = plane.shape[:2]
+    joined = np.zeros((2 * rows - 1, 2 * columns - 1), np.uint8)
+    joined[::2, ::2] = 1
+    joined[::2, 1::2] = _goes_on(plane[:, :-1], plane[:, 1:], 1, bend)
+    joined[1::2, ::2] = _goes_on(plane[:-1], plane[1:], 2, bend)
+    label = cv2.connectedComponents(joined, connectivity=4)[1][::2, ::2]
+    return np.asarray(label.reshape(-1), np.intp)
 
 
 def _goes_on(a: Array, b: Array, axis: int, bend: float) -> NDArray[np.bool_]:
