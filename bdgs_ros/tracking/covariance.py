@@ -4,8 +4,8 @@ How far off a pose may be: from how much the parts of an image disagree about it
 Residuals of neighbouring pixels err together, so their number says nothing. Squares of the image
 are asked instead: at the pose that all of them chose, each still pulls a little its own way, and
 the spread of these pulls is what the pose inherits (the sandwich estimator with clusters [1]_).
-What the images leave open altogether, and what a camera in motion does while its clock is not
-known exactly, come on top.
+What the images leave open altogether, and what a camera in motion does while an image is exposed
+and read out, come on top.
 
 References
 ----------
@@ -67,8 +67,16 @@ def of_alignment(
     bread = np.linalg.inv(information)
     clusters = blocks_of_two(pulls.reshape(-1, cells.columns, 6)).reshape(-1, 6)
     spread = bread @ (clusters.T @ clusters) @ bread
-    clock = config.clock_s**2 * np.outer(velocity, velocity)
-    return np.asarray(config.spread * spread + config.open * open_covariance + clock)
+    smear = _smear(velocity, float(np.median(cells.depth_m[used])) if used.any() else 1.0)
+    return np.asarray(
+        config.spread * spread + config.open * open_covariance + config.smear_s**2 * smear
+    )
+
+
+def _smear(velocity: Array, depth_m: float) -> Array:
+    """Return the covariance of what shifts in the image in a second, whatever its direction."""
+    spin = float(np.linalg.norm(velocity[3:]) + np.linalg.norm(velocity[:3]) / depth_m)
+    return spin**2 * np.diag([depth_m**2] * 3 + [1.0] * 3)
 
 
 def chained(first: Array, T_first_second: Pose, second: Array) -> Array:

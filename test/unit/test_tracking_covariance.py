@@ -11,7 +11,7 @@ from bdgs_ros.tracking import covariance
 from bdgs_ros.tracking.align import Cells
 
 ROWS, COLUMNS, POINTS = 16, 20, 30
-PLAIN = CovarianceConfig(spread=1.0, open=0.0, clock_s=0.0)
+PLAIN = CovarianceConfig(spread=1.0, open=0.0, smear_s=0.0)
 NOTHING = np.zeros((6, 6))
 
 
@@ -58,11 +58,12 @@ def test_what_moves_has_no_say() -> None:
 def test_motion_and_what_is_left_open_come_on_top() -> None:
     cells, error = solved(np.random.default_rng(2), 0.0)
     moved = np.zeros((ROWS, COLUMNS), bool)
-    config = CovarianceConfig(spread=0.0, open=0.5, clock_s=0.01)
-    velocity = np.array([1.0, 0, 0, 0, 2.0, 0])
+    config = CovarianceConfig(spread=0.0, open=0.5, smear_s=0.01)
+    cells.depth_m[:] = 2.0
+    velocity = np.array([1.0, 0, 0, 0, 2.0, 0])  # the image shifts by 2 and 1 / 2 rad/s
     found = covariance.of_alignment(cells, moved, error, np.eye(6), velocity, config)
-    assert np.sqrt(found[0, 0] - 0.5) == pytest.approx(0.01)
-    assert np.sqrt(found[4, 4] - 0.5) == pytest.approx(0.02)
+    assert np.sqrt(found[0, 0] - 0.5) == pytest.approx(0.05)  # m at a depth of 2 m
+    assert np.sqrt(found[4, 4] - 0.5) == pytest.approx(0.025)
 
 
 def test_a_chain_adds_up_as_samples_do() -> None:

@@ -154,16 +154,21 @@ class PartsConfig:
 
 @dataclass(frozen=True)
 class CovarianceConfig:
-    """How far off poses may be."""
+    """
+    How far off poses may be.
+
+    Calibrated on what fourteen runs of two real and six synthetic recordings were off;
+    docs/tracking.md says by how much.
+    """
 
     spread: float = param(
-        2.0, 'variance by which squares of an image disagree counts so often', low=0.0
+        6.0, 'variance by which squares of an image disagree counts so often', low=0.0
     )
     open: float = param(
-        0.01, 'variance that the images leave open, `correlated_pixels` with it', low=0.0
+        0.03, 'variance that the images leave open, `correlated_pixels` with it', low=0.0
     )
-    clock_s: float = param(
-        0.002, 'doubt of when an image was taken, times the velocity', unit='s', low=0.0
+    smear_s: float = param(
+        0.003, 'what shifts in the image meanwhile, by blur and rows, is doubt', unit='s', low=0.0
     )
 
 
