@@ -10,7 +10,7 @@ zero after every update, when it is folded into the pose.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
@@ -27,11 +27,7 @@ Matrix = NDArray[np.float64]
 _START_SPEED = 0.5  # m/s, standard deviation of the velocity while nothing is known
 _START_SPIN = 1.0  # rad/s
 _LATELY_S = 0.5
-_FASTER, _CALMER, _MOST_UNREST = 2.0, 0.95, 100.0  # of the variance of the acceleration
 _USUAL_DEPTH_M = 3.0  # of the rooms that people carry cameras through
-_LAG_GAIN = 0.2
-_LAG_VARIANCE = _LAG_GAIN / (2 - _LAG_GAIN)  # of a mean of white noise
-_SURPRISING = 6.0  # times that
 _LEAST_VARIANCE = 1e-10  # of a measurement, so that the innovation can be inverted
 
 
@@ -43,10 +39,6 @@ class _State:
     """Shape (6,): (v, w) in the camera's frame, m/s and rad/s."""
     covariance: Matrix
     """Shape (12, 12): of (xi, nu)."""
-    unrest: float = 1.0
-    """How often the variance of the acceleration is that of the configuration."""
-    lag: Matrix = field(default_factory=lambda: np.zeros(6))
-    """How far predictions were off lately, mean, in standard deviations."""
 
 
 class MotionPredictor:
@@ -148,7 +140,7 @@ class MotionPredictor:
         innovation = se3.log(se3.inverse(predicted.T_world_camera) @ measured)
         if self._is_outside(innovation, predicted.covariance[:6, :6] + noise):
             return self._start(stamp_ns, measured, noise)
-        return self._correct(_surprised(predicted, innovation, noise), innovation, noise)
+        return self._correct(predicted, innovation, noise)
 
     def expects(self, stamp_ns: int, T_world_camera: Pose, covariance: Matrix) -> bool:
         """Tell whether the camera was seen lately, and a measured pose is where it may be now."""
@@ -196,7 +188,7 @@ class MotionPredictor:
         F = np.eye(12)
         F[:6, :6] = se3.adjoint(se3.inverse(step))
         F[:6, 6:] = dt * np.eye(6)
-        covariance = F @ state.covariance @ F.T + state.unrest * self._process_noise(dt)
+        covariance = F @ state.covariance @ F.T + self._process_noise(dt)
         pose = se3.orthonormalise(state.T_world_camera @ step)
         return replace(state, stamp_ns=stamp_ns, T_world_camera=pose, covariance=covariance)
 
@@ -248,20 +240,3 @@ class MotionPredictor:
         velocity = kalman.x[6:] if self._config.model == 'kalman' else np.zeros(6)
         covariance = 0.5 * (kalman.P + kalman.P.T)
         return replace(predicted, T_world_camera=pose, velocity=velocity, covariance=covariance)
-
-
-def _surprised(predicted: _State, pulled: Matrix, noise: Matrix) -> _State:
-    """
-    Expect more of a camera that accelerates more than expected: by scale or by temper.
-
-    The measured pose was pulled towards the prediction, with their covariances P and R. The
-    images alone would have put it `(P + R) P^-1` times as far off. Single frames may be noise;
-    what lags behind for some frames in one direction is not.
-    """
-    both = predicted.covariance[:6, :6] + noise
-    off = both @ np.linalg.solve(predicted.covariance[:6, :6], pulled)
-    white = np.linalg.solve(np.linalg.cholesky(both), off)
-    lag = predicted.lag + _LAG_GAIN * (white - predicted.lag)
-    is_more = float((lag**2).max()) / _LAG_VARIANCE > _SURPRISING
-    unrest = predicted.unrest * (_FASTER if is_more else _CALMER)
-    return replace(predicted, lag=lag, unrest=float(np.clip(unrest, 1.0, _MOST_UNREST)))
