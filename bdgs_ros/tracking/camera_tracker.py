@@ -29,12 +29,12 @@ from bdgs_ros.core.types import (
     TrackingStatus,
 )
 from bdgs_ros.tracking import covariance
-from bdgs_ros.tracking.align import Aligner, ImagePyramid
+from bdgs_ros.tracking.align import Aligner, ImagePyramid, ResidualMaps
 from bdgs_ros.tracking.broken import BrokenRows, without_rows
 from bdgs_ros.tracking.keyframe_choice import KeyframeChoice
 from bdgs_ros.tracking.loss import Evidence, LossTest
 from bdgs_ros.tracking.motion import MotionPredictor
-from bdgs_ros.tracking.movers import MoverMask
+from bdgs_ros.tracking.movers import MoverMask, gone_from_model
 from bdgs_ros.tracking.parts import Parts, find_world
 from bdgs_ros.tracking.places import Place, Places
 from bdgs_ros.tracking.starts import (
@@ -368,9 +368,12 @@ class CameraTracker:
             prior = np.maximum(prior, moved)
             if parts.is_other or not is_known:
                 coarse, current = self._align_world(start, current, prior, first, parts)
-        p_dynamic = self._see_movers(prior, current, coarse)
-        current = self._aligner.with_dynamic(current, p_dynamic, self._sweep(stamp_ns, coarse))
-        fine = self._refine(current, coarse, start.information)
+        maps = self._compare_to_model(current, coarse)
+        p_dynamic = self._see_movers(prior, maps)
+        sweep = self._sweep(stamp_ns, coarse)
+        current = self._aligner.with_dynamic(current, p_dynamic, sweep)
+        still = self._without_gone(current, p_dynamic, maps, sweep)
+        fine = self._refine(still, coarse, start.information)
         spread = self._relative_covariance(parts, first, coarse, fine)
         return Attempt(start, current, coarse, fine, p_dynamic, spread, p_moving)
 
@@ -444,18 +447,32 @@ class CameraTracker:
         found = self._align(start.reference, still, guess, start.information, start.T_world_camera)
         return found, still
 
-    def _see_movers(
-        self,
-        prior: ProbabilityImage,
-        current: ImagePyramid,
-        coarse: Estimate,
-    ) -> ProbabilityImage:
-        """Join the prior with what stands nearer than the static map (class-agnostic prior)."""
+    def _compare_to_model(self, current: ImagePyramid, coarse: Estimate) -> ResidualMaps | None:
         if self._model is None or not self._config.masked:
-            return prior
+            return None
         T_current_model = se3.inverse(coarse.T_world_camera) @ self._model.T_world_camera
-        maps = self._aligner.residual_maps(self._model.pyramid, current, T_current_model)
+        return self._aligner.residual_maps(self._model.pyramid, current, T_current_model)
+
+    def _see_movers(self, prior: ProbabilityImage, maps: ResidualMaps | None) -> ProbabilityImage:
+        """Join the prior with what stands nearer than the static map (class-agnostic prior)."""
+        if maps is None:
+            return prior
         return np.maximum(prior, self._movers.update(maps, prior.shape))
+
+    def _without_gone(
+        self,
+        current: ImagePyramid,
+        p_dynamic: ProbabilityImage,
+        maps: ResidualMaps | None,
+        sweep: NDArray[np.float64],
+    ) -> ImagePyramid:
+        """Return the image without what is seen through the static map."""
+        if maps is None:
+            return current
+        gone = gone_from_model(maps, p_dynamic.shape, self._config.movers)
+        if gone is None:
+            return current
+        return self._aligner.with_dynamic(current, np.maximum(p_dynamic, gone), sweep)
 
     def _refine(
         self, current: ImagePyramid, coarse: Estimate, information: NDArray[np.float64]

@@ -5,7 +5,7 @@ import pytest
 
 from bdgs_ros.core.config.tracking import MoversConfig
 from bdgs_ros.tracking.align import ResidualMaps
-from bdgs_ros.tracking.movers import MoverMask, nearer_than_model
+from bdgs_ros.tracking.movers import MoverMask, gone_from_model, nearer_than_model
 
 CONFIG = MoversConfig()
 SHAPE = (240, 320)
@@ -50,3 +50,28 @@ def test_the_next_frame_expects_it_a_little_larger() -> None:
     assert expected.sum() > 1.05 * seen.sum()
     mask.reset()
     assert not mask.expected(SHAPE).any()
+
+
+def test_a_door_that_was_opened_is_gone_up_to_its_hinges() -> None:
+    door = (slice(0, 120), slice(20, 80))
+    opened = maps(door, sigma=-20.0)
+    opened.depth_sigma[:, 70:80] = -0.4 * CONFIG.depth_sigma  # beside the hinges
+    opened.depth_sigma[10:20, 120:130] = -0.4 * CONFIG.depth_sigma  # noise elsewhere
+    gone = gone_from_model(opened, SHAPE, CONFIG)
+    assert gone is not None
+    assert (gone[:, 40:160] == 255).all()
+    assert not gone[:, 164:].any()
+
+
+@pytest.mark.parametrize(
+    'residuals',
+    [
+        maps((slice(0, 120), slice(0, 40)), sigma=-20.0),  # a quarter of the view
+        maps((slice(0, 120), slice(20, 80)), sigma=20.0),  # nearer
+        maps((slice(0, 120), slice(20, 80)), sigma=-20.0, valid=False),
+        maps((slice(0, 120), slice(0, 160)), sigma=-0.5 * CONFIG.depth_sigma),  # a pose is off
+        maps((slice(0, 120), slice(0, 150)), sigma=-20.0),  # there would be no map left
+    ],
+)
+def test_nothing_else_is_gone(residuals: ResidualMaps) -> None:
+    assert gone_from_model(residuals, SHAPE, CONFIG) is None

@@ -115,7 +115,7 @@ class RefineConfig:
 
 @dataclass(frozen=True)
 class MoversConfig:
-    """What counts as standing before the static map, whatever the detector says."""
+    """What counts as standing before the static map, or as gone, whatever the detector says."""
 
     depth_sigma: float = param(
         8.0, 'nearer than the map by this', unit='sigma_z', low=1.0, high=100.0
@@ -124,6 +124,9 @@ class MoversConfig:
         0.003, 'smaller things are noise', unit='share of the image', low=0.0, high=1.0
     )
     p_dynamic: float = param(0.8, 'probability given to such pixels', low=0.0, high=1.0)
+    gone_share: float = param(
+        0.3, 'so much of the map is seen through: not aligned to', low=0.0, high=1.0
+    )
     reach: float = param(
         0.011, 'a mover comes no further in a frame', unit='share of the width', low=0.0, high=0.5
     )
