@@ -8,12 +8,13 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Any
 
+from bdgs_ros.tracking import camera_tracker
 from bdgs_ros.tracking.align import Aligner
 from bdgs_ros.tracking.camera_tracker import CameraTracker
 from bdgs_ros.tracking.motion import MotionPredictor
 from bdgs_ros.tracking.movers import MoverMask
 
-PARTS = ('pyramid', 'predict', 'coarse', 'movers', 'refine')
+PARTS = ('pyramid', 'predict', 'coarse', 'world', 'movers', 'refine')
 
 _Method = Callable[..., Any]
 
@@ -28,11 +29,13 @@ def _always(name: str) -> Callable[..., str]:
     return lambda *_, **__: name
 
 
-# Public methods, and which part of a frame's time they are.
-_WATCHED: tuple[tuple[type, str, Callable[..., str]], ...] = (
+# Public functions and where they are called, and which part of a frame's time they are.
+_WATCHED: tuple[tuple[Any, str, Callable[..., str]], ...] = (
     (Aligner, 'pyramid', _always('pyramid')),
     (Aligner, 'with_dynamic', _always('pyramid')),
     (Aligner, 'align', _of_alignment),
+    (Aligner, 'cells', _always('world')),
+    (camera_tracker, 'find_world', _always('world')),
     (Aligner, 'residual_maps', _always('movers')),
     (MoverMask, 'expected', _always('movers')),
     (MoverMask, 'update', _always('movers')),
@@ -58,7 +61,7 @@ class PartTimes:
     def __init__(self) -> None:
         self._ms: dict[str, float] = defaultdict(float)
         self._inside = False
-        self._replaced: list[tuple[type, str, _Method]] = []
+        self._replaced: list[tuple[Any, str, _Method]] = []
 
     def take(self) -> dict[str, float]:
         """Return the milliseconds since the last call, by part; `all` is the whole frame."""
@@ -81,7 +84,7 @@ class PartTimes:
             setattr(owner, name, method)
         self._replaced = []
 
-    def _replace(self, owner: type, name: str, method: _Method) -> None:
+    def _replace(self, owner: Any, name: str, method: _Method) -> None:
         self._replaced.append((owner, name, getattr(owner, name)))
         setattr(owner, name, method)
 

@@ -357,17 +357,9 @@ class CameraTracker:
     ) -> Attempt:
         """Align coarse to fine, see what moves, refine against the rendered static map."""
         first = self._align(start.reference, current, start.T_world_camera, start.information)
-        parts, coarse = self._find_world(start, current, first), first
-        p_moving = None
-        if parts is not None:
-            moved = parts.mask(prior.shape, self._config.movers.p_dynamic)
-            unnamed = parts.unnamed(prior)
-            p_moving = parts.large(unnamed, prior.shape, self._config.movers.p_dynamic)
-            least = _LEAST_MOVED_HURRIED if self._is_hurried else _LEAST_MOVED
-            is_known = unnamed.mean() <= least  # and had no say before
-            prior = np.maximum(prior, moved)
-            if parts.is_other or not is_known:
-                coarse, current = self._align_world(start, current, prior, first, parts)
+        parts = self._find_world(start, current, first)
+        p_moving = None if parts is None else parts.large(prior, self._config.movers.p_dynamic)
+        coarse, current, prior = self._align_world(start, current, prior, first, parts)
         maps = self._compare_to_model(current, coarse)
         p_dynamic = self._see_movers(prior, maps)
         sweep = self._sweep(stamp_ns, coarse)
@@ -437,15 +429,22 @@ class CameraTracker:
         start: Start,
         current: ImagePyramid,
         prior: ProbabilityImage,
-        coarse: Estimate,
-        parts: Parts,
-    ) -> tuple[Estimate, ImagePyramid]:
-        """Align once more, without what moves against the world."""
+        first: Estimate,
+        parts: Parts | None,
+    ) -> tuple[Estimate, ImagePyramid, ProbabilityImage]:
+        """Mask what moves against the world, and align once more if it had a say."""
+        if parts is None:
+            return first, current, prior
+        least = _LEAST_MOVED_HURRIED if self._is_hurried else _LEAST_MOVED
+        had_no_say = parts.unnamed(prior).mean() <= least
+        prior = np.maximum(prior, parts.mask(prior.shape, self._config.movers.p_dynamic))
+        if had_no_say and not parts.is_other:
+            return first, current, prior
         still = self._aligner.with_dynamic(current, prior)
-        T_current_reference = se3.exp(parts.step) @ coarse.quality.T_current_reference
+        T_current_reference = se3.exp(parts.step) @ first.quality.T_current_reference
         guess = start.reference.T_world_camera @ se3.inverse(T_current_reference)
         found = self._align(start.reference, still, guess, start.information, start.T_world_camera)
-        return found, still
+        return found, still, prior
 
     def _compare_to_model(self, current: ImagePyramid, coarse: Estimate) -> ResidualMaps | None:
         if self._model is None or not self._config.masked:

@@ -60,24 +60,22 @@ class Parts:
         is_named = cv2.resize(some, size, interpolation=cv2.INTER_AREA) > DYNAMIC_THRESHOLD
         return np.asarray(self.moved & ~is_named)
 
-    def large(
-        self, unnamed: Mask, shape: tuple[int, int], p_dynamic: float
-    ) -> ProbabilityImage | None:
+    def large(self, prior: ProbabilityImage, p_dynamic: float) -> ProbabilityImage | None:
         """
-        Return an image of what is large and clearly moves of the unnamed; None for nothing.
+        Return the same of what is large, clearly moves, and is not in the prior; None for nothing.
 
         Keyframes go by this: what they call dynamic is no landmark and does not enter the map, so
         that single squares must not be called so.
         """
         solid = cv2.morphologyEx(
-            unnamed.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)
+            self.unnamed(prior).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)
         )
         count, label = cv2.connectedComponents(solid)
         large = np.zeros_like(self.moved)
         for i in range(1, count):
             own = label == i
             large |= own & (own.mean() > _LARGE and np.median(self.excess[own]) > _CLEARLY)
-        return _grown(large, shape, p_dynamic) if large.any() else None
+        return _grown(large, prior.shape, p_dynamic) if large.any() else None
 
 
 def _grown(squares: Mask, shape: tuple[int, int], p_dynamic: float) -> ProbabilityImage:

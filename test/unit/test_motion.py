@@ -134,3 +134,18 @@ def test_an_unseen_camera_does_not_run_away() -> None:
     assert np.allclose(far[1], far[2])
     travelled = np.linalg.norm(se3.log(se3.inverse(pose_at(19)) @ far[2])[:3])
     assert travelled == pytest.approx(0.2 * np.linalg.norm(VELOCITY[:3]), rel=0.01)
+
+
+@pytest.mark.parametrize('off', [0.0, 0.05, 2.0])  # as expected, beside it, outside the gate
+def test_to_ask_what_the_velocity_would_be_changes_nothing(off: float) -> None:
+    asked, other = MotionPredictor(MotionConfig()), MotionPredictor(MotionConfig())
+    push = se3.exp(np.array([off, 0, 0, 0, 0, 0]))
+    for predictor in (asked, other):
+        follow(predictor, 10)
+    would_be = asked.velocity_with(10 * PERIOD_NS, pose_at(10) @ push, NOISE)
+    for predictor in (asked, other):
+        predictor.update(10 * PERIOD_NS, pose_at(10) @ push, NOISE)
+    assert np.array_equal(asked.velocity, would_be)
+    (pose, spread), (same, same_spread) = (p.predict(11 * PERIOD_NS) for p in (asked, other))
+    assert np.array_equal(pose, same)
+    assert np.array_equal(spread, same_spread)

@@ -143,15 +143,13 @@ def test_keyframes_go_by_what_is_large_and_unnamed() -> None:
     """A door over half of the view is no landmark; what a detector has named is known already."""
     found = world(cells(left(0.5), 2 * STEP, RESTING), RESTING, SURE)
     prior = np.zeros((ROWS * 16, COLUMNS * 16), np.uint8)
-    large = found.large(found.unnamed(prior), prior.shape, 0.8)
+    large = found.large(prior, 0.8)
     assert large is not None
     assert large.shape == prior.shape
     assert ((large > 127) == np.kron(left(0.5), np.ones((16, 16), bool))).mean() > 0.95
-    named = found.unnamed(np.full_like(prior, 255))
-    assert found.large(named, prior.shape, 0.8) is None
+    assert found.large(np.full_like(prior, 255), 0.8) is None
     small = np.zeros((ROWS, COLUMNS), bool)
     small[4:7, 4:8] = True
     slow = cells(left(0.5), 0.4 * STEP, RESTING)
     for seen in (cells(small, 2 * STEP, RESTING), slow):
-        found = world(seen, RESTING, SURE)
-        assert found.large(found.unnamed(prior), prior.shape, 0.8) is None
+        assert world(seen, RESTING, SURE).large(prior, 0.8) is None
