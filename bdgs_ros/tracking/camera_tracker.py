@@ -263,11 +263,11 @@ class CameraTracker:
         for start in self._starts(frame, prior, hurried):
             attempt = self._attempt(start, frame.stamp_ns, current, prior)
             first = first or attempt
-            if not self._loss.objection(attempt.best.quality):
+            if not self._objection(attempt):
                 break
         assert first is not None
         self.evidence = self._loss.evidence(first.best.quality)
-        if self._loss.objection(attempt.best.quality):
+        if self._objection(attempt):
             return self._lose(frame, first)
         return self._conclude(frame, attempt)
 
@@ -484,6 +484,11 @@ class CameraTracker:
         )
         return coarse if self._loss.objection(fine.quality) else fine
 
+    def _objection(self, attempt: Attempt) -> str:
+        """Say in words why a pose is not to be believed; nothing where it is."""
+        own = self._loss.objection(attempt.best.quality)
+        return own or self._loss.contradiction(attempt.coarse, attempt.best)
+
     def _conclude(self, frame: RgbdFrame, attempt: Attempt) -> TrackingResult:
         """Believe a pose; where the camera was lost, only one that is sure or seen twice."""
         start, estimate = attempt.start, attempt.best
@@ -539,8 +544,7 @@ class CameraTracker:
     def _lose(self, frame: RgbdFrame, attempt: Attempt) -> TrackingResult:
         """No start led anywhere: the camera is lost, or stays so."""
         if not self._is_lost:
-            objection = self._loss.objection(attempt.best.quality)
-            _log.warning('lost at stamp %d ns: %s', frame.stamp_ns, objection)
+            _log.warning('lost at stamp %d ns: %s', frame.stamp_ns, self._objection(attempt))
         self._hypothesis = None
         return self._lost(frame, attempt)
 
@@ -555,9 +559,7 @@ class CameraTracker:
         assert self._keyframe is not None
         T_keyframe_world = se3.inverse(self._keyframe.T_world_camera)
         T_keyframe_camera = T_keyframe_world @ attempt.best.T_world_camera
-        quality = attempt.coarse.quality
-        sigma_share = self._loss.evidence(quality).sigma_share
-        return self._choice.is_due(T_keyframe_camera, quality.overlap, sigma_share)
+        return self._choice.is_due(T_keyframe_camera, attempt.coarse.quality.overlap)
 
     def _can_be_keyframe(self, frame: RgbdFrame, attempt: Attempt) -> bool:
         return self._is_whole and self._loss.can_be_aligned_to(frame.depth_m, attempt.p_dynamic)

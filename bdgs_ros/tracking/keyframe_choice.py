@@ -29,30 +29,24 @@ class KeyframeChoice:
         self.depth_m = 1.0 if keyframe is None else _median_depth(keyframe)
         """Of the keyframe's view, median."""
         self._frames = 0
-        self._least_sigma = np.inf
 
     def count(self) -> None:
         """Note that another frame came."""
         self._frames += 1
 
-    def is_due(self, T_keyframe_camera: Pose, overlap: float, sigma_share: float) -> bool:
+    def is_due(self, T_keyframe_camera: Pose, overlap: float) -> bool:
         """
-        Choose by translation over depth, rotation, overlap, age, and how open the pose has become.
-
-        Where people walk before the keyframe's view it determines less and less, though the camera
-        may stand still, and another view of what they leave determines more.
+        Choose by translation over depth, rotation, overlap and age.
 
         All are against the last keyframe; the model view may be of an older one, when mapping is
         behind.
         """
         move = float(np.linalg.norm(T_keyframe_camera[:3, 3])) / self.depth_m
-        self._least_sigma = min(self._least_sigma, sigma_share)
         turn = np.rad2deg(se3.rotation_angle_rad(T_keyframe_camera))
         return bool(
             move > self._config.translation
             or turn > self._config.rotation_deg
             or overlap < self._config.overlap
-            or sigma_share > self._config.sigma_ratio * self._least_sigma
             or self._frames >= self._config.max_interval
         )
 

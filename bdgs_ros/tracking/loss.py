@@ -14,9 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bdgs_ros.core import se3
 from bdgs_ros.core.config.tracking import LossConfig
 from bdgs_ros.core.types import DepthImage, ProbabilityImage
 from bdgs_ros.tracking.align import AlignResult
+from bdgs_ros.tracking.starts import Estimate
 
 _STRIDE = 4  # pixels; a share needs no more
 
@@ -80,6 +82,30 @@ class LossTest:
         if found.sigma_rad > limits.sigma_rad:
             return f'the images leave the direction open to {np.rad2deg(found.sigma_rad):.0f} deg'
         return ''
+
+    def contradiction(self, coarse: Estimate, fine: Estimate) -> str:
+        """
+        Say how far keyframe and map put the camera apart, where neither of them fits.
+
+        Parameters
+        ----------
+        coarse, fine : Estimate
+            Aligned to the keyframe and to the map; one and the same where there is no map.
+
+        """
+        best = max(coarse.quality.inlier_ratio, fine.quality.inlier_ratio)
+        if coarse is fine or best >= self._config.fits:
+            return ''
+        T_coarse_fine = se3.inverse(coarse.T_world_camera) @ fine.T_world_camera
+        way_m = float(np.linalg.norm(T_coarse_fine[:3, 3]))
+        turn = se3.rotation_angle_rad(T_coarse_fine)
+        if way_m / fine.quality.depth_m + turn <= self._config.apart:
+            return ''
+        return (
+            f'keyframe and map put it {100 * way_m:.0f} cm and {np.rad2deg(turn):.1f} deg apart, '
+            f'with {100 * coarse.quality.inlier_ratio:.0f} and '
+            f'{100 * fine.quality.inlier_ratio:.0f} % inliers'
+        )
 
     def can_be_aligned_to(self, depth_m: DepthImage, p_dynamic: ProbabilityImage) -> bool:
         """

@@ -9,6 +9,7 @@ from bdgs_ros.core import se3
 from bdgs_ros.core.config.tracking import LossConfig
 from bdgs_ros.tracking.align import AlignResult
 from bdgs_ros.tracking.loss import LossTest
+from bdgs_ros.tracking.starts import Estimate
 
 
 def aligned(
@@ -56,3 +57,27 @@ def test_frames_that_nothing_can_be_aligned_to(
     p_dynamic = np.zeros((100, 400), np.uint8)
     p_dynamic[:, : round(400 * dynamic)] = 255
     assert LossTest(LossConfig()).can_be_aligned_to(depth_m, p_dynamic) is expected
+
+
+@pytest.mark.parametrize(
+    ('keyframe', 'model', 'off', 'words'),
+    [
+        (0.4, 0.7, [0.1, 0, 0, 0, 0, 0], '10 cm and 0.0 deg apart, with 40 and 70 % inliers'),
+        (0.4, 0.7, [0, 0, 0, 0, 0.05, 0], '0 cm and 2.9 deg apart'),
+        (0.4, 0.95, [0.1, 0, 0, 0, 0, 0], ''),  # the map fits: the keyframe was misled
+        (0.9, 0.7, [0.1, 0, 0, 0, 0, 0], ''),
+        (0.4, 0.7, [0.02, 0, 0, 0, 0, 0], ''),
+    ],
+)
+def test_where_neither_fits_keyframe_and_map_have_to_agree(
+    keyframe: float, model: float, off: list[float], words: str
+) -> None:
+    coarse = Estimate(se3.identity(), aligned(keyframe))
+    fine = Estimate(se3.exp(np.array(off)), aligned(model))
+    found = LossTest(LossConfig()).contradiction(coarse, fine)
+    assert words in found if words else found == ''
+
+
+def test_one_estimate_does_not_contradict_itself() -> None:
+    only = Estimate(se3.identity(), aligned(0.4))
+    assert LossTest(LossConfig()).contradiction(only, only) == ''

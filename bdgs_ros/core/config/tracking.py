@@ -93,9 +93,6 @@ class KeyframeConfig:
     )
     rotation_deg: float = param(8.0, 'turn from the last keyframe', unit='deg', low=0.0, high=180)
     overlap: float = param(0.85, 'share of the reference still in view', low=0.0, high=1.0)
-    sigma_ratio: float = param(
-        3.0, 'the pose is left so many times as open as once since the last keyframe', low=1.0
-    )
     max_interval: int = param(15, 'frames until a keyframe is forced', low=1, high=1000)
 
 
@@ -207,6 +204,13 @@ class LossConfig:
     inlier_ratio: float = param(
         0.2, 'fewer inliers among the compared pixels: lost', low=0.0, high=1.0
     )
+    apart: float = param(
+        0.03,
+        'keyframe and map shift the view against each other by this: lost if neither fits',
+        unit='rad',
+        low=0.0,
+    )
+    fits: float = param(0.8, 'inliers of one that decides alone', low=0.0, high=1.0)
     coverage: float = param(
         0.04, 'smaller share of static pixels with depth: no keyframe', low=0.0, high=1.0
     )
