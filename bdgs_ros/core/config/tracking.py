@@ -205,7 +205,7 @@ class LossConfig:
         0.2, 'fewer inliers among the compared pixels: lost', low=0.0, high=1.0
     )
     apart: float = param(
-        0.03,
+        0.05,
         'keyframe and map shift the view against each other by this: lost if neither fits',
         unit='rad',
         low=0.0,
