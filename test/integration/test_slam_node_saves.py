@@ -50,7 +50,7 @@ def test_an_answer_that_was_lost_is_asked_for_again(lost: int) -> None:
 
 def test_silence_ends_with_the_stacks_of_all_nodes() -> None:
     node = Mock(_savers={'save': Client(lost=100)})
-    with pytest.raises(BdgsError, match="'save' did not answer within 0.3 s"):
+    with pytest.raises(BdgsError, match=r"'save' did not answer within 0\.3 s"):
         slam_node.SlamNode._call(node, 'save')
     node._children.show_stacks.assert_called_once()
 
