@@ -39,6 +39,17 @@ _SERVICE_TIMEOUT_S = 120.0
 _ASKED_AT_MOST = 6  # times within it; to save twice does no harm
 
 
+def _ask(client: Any) -> Trigger.Response | None:
+    """Call a service, again and again: answers get lost while it does not know its caller yet."""
+    answers: queue.Queue[Trigger.Response] = queue.Queue()
+    for _ in range(_ASKED_AT_MOST):
+        future = client.call_async(Trigger.Request())
+        future.add_done_callback(lambda future: answers.put(future.result()))
+        with contextlib.suppress(queue.Empty):
+            return answers.get(timeout=_SERVICE_TIMEOUT_S / _ASKED_AT_MOST)
+    return None
+
+
 class SlamNode(GraphNode):
     """Start, watch and end the graph; at the end of a recording, write the results."""
 
@@ -180,15 +191,8 @@ class SlamNode(GraphNode):
         client = self._savers[name]
         if not client.wait_for_service(_SERVICE_TIMEOUT_S):
             raise BdgsError(f"nobody offers '{name}'")
-        # An answer is lost where the service does not know its caller yet, just after the start.
-        answers: queue.Queue[Trigger.Response] = queue.Queue()
-        for _ in range(_ASKED_AT_MOST):
-            future = client.call_async(Trigger.Request())
-            future.add_done_callback(lambda future: answers.put(future.result()))
-            with contextlib.suppress(queue.Empty):
-                answer = answers.get(timeout=_SERVICE_TIMEOUT_S / _ASKED_AT_MOST)
-                break
-        else:
+        answer = _ask(client)
+        if answer is None:
             self._children.show_stacks()
             raise BdgsError(
                 f"'{name}' did not answer within {_SERVICE_TIMEOUT_S:g} s; the log says where the "

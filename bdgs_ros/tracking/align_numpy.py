@@ -445,6 +445,7 @@ def _judged(
         for mixture in (MEAN, HALF)
     )
     agreed = mean.pop('information')
+    del mean['gradient']  # the kernel does not tell it either
     agreed[:6, :6] -= _DOUBT * half['information'][:6, :6]
     both, one = mean['texture'], half['texture']
     return {**mean, 'agreed': agreed, 'texture': (both - one) / max(both + one, 1e-12)}

@@ -260,16 +260,16 @@ class CameraTracker:
             return self._begin(frame, current, prior)
         self._choice.count()
         first: Attempt | None = None
+        believed: Attempt | None = None
         for start in self._starts(frame, prior, hurried):
             attempt = self._attempt(start, frame.stamp_ns, current, prior)
             first = first or attempt
             if not self._objection(attempt):
+                believed = attempt
                 break
         assert first is not None
         self.evidence = self._loss.evidence(first.best.quality)
-        if self._objection(attempt):
-            return self._lose(frame, first)
-        return self._conclude(frame, attempt)
+        return self._lose(frame, first) if believed is None else self._conclude(frame, believed)
 
     def compare(self, share: float) -> None:
         """Compare this share of the points of `tracking.align.max_points` from now on."""

@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 
 from bdgs_ros.core import se3
 from bdgs_ros.core.config.tracking import LossConfig
+from bdgs_ros.core.images import thinned
 from bdgs_ros.core.types import DepthImage, ProbabilityImage
 from bdgs_ros.tracking.align import AlignResult
 from bdgs_ros.tracking.starts import Estimate
-
-_STRIDE = 4  # pixels; a share needs no more
 
 
 @dataclass(frozen=True)
@@ -122,8 +121,7 @@ class LossTest:
             P(dynamic) x 255.
 
         """
-        known = depth_m[::_STRIDE, ::_STRIDE] > 0
-        still = p_dynamic[::_STRIDE, ::_STRIDE] < 128
+        known, still = thinned(depth_m) > 0, thinned(p_dynamic) < 128
         return bool((known & still).mean() >= self._config.coverage)
 
 

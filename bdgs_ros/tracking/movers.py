@@ -52,12 +52,8 @@ def gone_from_model(
 
     Parameters
     ----------
-    maps : ResidualMaps
-        Depth residuals of the current frame against the model, negative where farther.
-    shape : tuple of int
-        (H, W) of the result; the maps may be smaller.
-    config : MoversConfig
-        Threshold and smallest size.
+    maps, shape, config
+        As for `nearer_than_model`.
 
     Returns
     -------

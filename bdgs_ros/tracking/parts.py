@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bdgs_ros.core.config.tracking import PartsConfig
+from bdgs_ros.core.images import thinned
 from bdgs_ros.core.types import DYNAMIC_THRESHOLD, ProbabilityImage
 from bdgs_ros.tracking.align import Cells
 from bdgs_ros.tracking.surfaces import planes, things
@@ -31,7 +32,6 @@ _LIKELY, _ROUNDS = 4, 3  # motions that are refined, and how often
 _LOOSE = np.diag([0.1**-2] * 3 + [0.1**-2] * 3)  # m and rad: a proposal stays in the linear range
 _LEFT = 0.25  # of the surface has to remain
 _LARGE, _CLEARLY = 0.15, 8.0  # share of the view, and excess: for keyframes to go by
-_STRIDE = 4  # pixels; a share needs no more
 _LEAST_NOISE = 0.3  # residuals over those of the sensor
 
 
@@ -56,7 +56,7 @@ class Parts:
     def unnamed(self, prior: ProbabilityImage) -> Mask:
         """Return which squares move that the prior does not call dynamic, [rows, columns]."""
         size = (self.moved.shape[1], self.moved.shape[0])
-        some = np.ascontiguousarray(prior[::_STRIDE, ::_STRIDE])
+        some = np.ascontiguousarray(thinned(prior))
         is_named = cv2.resize(some, size, interpolation=cv2.INTER_AREA) > DYNAMIC_THRESHOLD
         return np.asarray(self.moved & ~is_named)
 

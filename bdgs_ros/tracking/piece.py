@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from bdgs_ros.core import se3
 from bdgs_ros.core.config import TrackingConfig
+from bdgs_ros.core.images import thinned
 from bdgs_ros.core.types import (
     DYNAMIC_THRESHOLD,
     Keyframe,
@@ -44,7 +45,6 @@ _log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 _LONGEST_STEP_S = 0.5  # between two frames that count as followed
-_STRIDE = 4  # pixels; a share needs no more
 
 
 @dataclass(frozen=True)
@@ -131,8 +131,8 @@ class _Followed:
             step_s = (frame.stamp_ns - self._last_ns) * 1e-9
             self.seconds += step_s if step_s < _LONGEST_STEP_S else 0.0
         self._last_ns = frame.stamp_ns
-        still = result.p_dynamic[::_STRIDE, ::_STRIDE] < DYNAMIC_THRESHOLD
-        self._still += float((still & (frame.depth_m[::_STRIDE, ::_STRIDE] > 0)).mean())
+        still = thinned(result.p_dynamic) < DYNAMIC_THRESHOLD
+        self._still += float((still & (thinned(frame.depth_m) > 0)).mean())
         self._frames += 1
 
     @property

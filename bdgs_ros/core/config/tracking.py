@@ -115,7 +115,7 @@ class MoversConfig:
     """What counts as standing before the static map, or as gone, whatever the detector says."""
 
     depth_sigma: float = param(
-        8.0, 'nearer than the map by this', unit='sigma_z', low=1.0, high=100.0
+        8.0, 'nearer than the map, or farther, by this', unit='sigma_z', low=1.0, high=100.0
     )
     min_share: float = param(
         0.003, 'smaller things are noise', unit='share of the image', low=0.0, high=1.0
