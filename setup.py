@@ -169,7 +169,6 @@ setup(
         'torch',
         'onnxruntime',
         'rosbags',
-        'filterpy',
         'tqdm',
         'matplotlib',
         'pyyaml',

@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import astuple
 from itertools import product
 from pathlib import Path
@@ -18,9 +14,9 @@ import numpy as np
 
 from bdgs_ros.bench import sequences
 from bdgs_ros.bench.harness import Cell, Options
+from bdgs_ros.bench.live import bag_of, busy_processes, graph_values, run_graph
 from bdgs_ros.bench.sequences import REAL
 from bdgs_ros.bench.tracking_parts import PARTS, PartTimes
-from bdgs_ros.core.errors import BdgsError
 from bdgs_ros.core.types import StampedPose, TrackingStatus, Trajectory
 
 NAME = 'tracking'
@@ -58,14 +54,6 @@ TABLES = {
 
 _SYNTH = ('walking_xyz', 'loop_room')
 _OTHER_CAMERAS = (sequences.SynthCamera(848, 480, 60), sequences.SynthCamera(1280, 720, 30))
-_LIVE_TIMEOUT_S = 300.0
-_BUSY = f"""
-import time
-end = time.monotonic() + {_LIVE_TIMEOUT_S}
-while time.monotonic() < end:
-    pass
-"""  # ends by itself, should the bench be killed
-_CAMERA_HZ = 30.0
 _LIVE_COLUMNS = {
     'frames': 'frames_sent',
     'passed_over': 'frames_dropped',
@@ -188,75 +176,17 @@ def part_columns(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 
 def _live(recording: Path, cell: Cell, options: Options) -> dict[str, Any]:
-    bag = _bag(recording, cell, options)
     output = options.work / 'runs' / cell.key
     output.mkdir(parents=True, exist_ok=True)
     beside, own = _live_values(cell.configuration)
-    values = {
-        'bag': bag.resolve(),
-        'output': output.resolve(),
-        'exit_at_end': 'true',
-        'mode': 'realtime',
-        'detection.weights': sequences.weights_path(options).resolve(),
-        **options.values,
-        **own,
-    }
-    with _busy_processes(beside):
-        _run_graph(values, output / 'log.txt')
+    values = graph_values(bag_of(recording, cell, options), output, options)
+    with busy_processes(beside):
+        run_graph({**values, **own}, output / 'log.txt')
     written = output / 'metrics.json'
     metrics = json.loads(written.read_text(encoding='utf-8'))
     last_sent_s = float(metrics['nodes']['replay']['last_sent_s'])
     end_ms = 1e3 * (written.stat().st_mtime - last_sent_s)
     return {**live_columns(metrics), 'end_ms': end_ms}
-
-
-@contextmanager
-def _busy_processes(count: int) -> Iterator[None]:
-    """Have other processes use a processor each, in sessions of their own."""
-    command = [sys.executable, '-c', _BUSY]
-    busy = [subprocess.Popen(command, start_new_session=True) for _ in range(count)]
-    try:
-        yield
-    finally:
-        for process in busy:
-            process.kill()
-            process.wait()
-
-
-def _bag(recording: Path, cell: Cell, options: Options) -> Path:
-    """Return the recording as a bag, converted now if it was not yet."""
-    from bdgs_ros.data.convert import ConvertOptions, convert
-
-    limit = sequences.frame_limit(cell)
-    bag = options.work / 'bags' / f'{recording.name}{"" if limit is None else f"_{limit}"}'
-    if not (bag / 'metadata.yaml').is_file():
-        duration_s = None if limit is None else limit / _CAMERA_HZ
-        convert(recording, bag, ConvertOptions(duration_s=duration_s))
-    return bag
-
-
-def _run_graph(values: Mapping[str, Any], log: Path) -> None:
-    command = [sys.executable, '-m', 'bdgs_ros.nodes.slam_node', '--ros-args']
-    for name, value in values.items():
-        command += ['-p', f'{name}:={value}']
-    domain = os.environ.get('ROS_DOMAIN_ID', str(10 + os.getpid() % 90))
-    environment = {
-        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-        **os.environ,
-        'ROS_DOMAIN_ID': domain,
-    }
-    with log.open('wb') as file:
-        try:
-            subprocess.run(
-                command,
-                env=environment,
-                stdout=file,
-                stderr=subprocess.STDOUT,
-                timeout=_LIVE_TIMEOUT_S,
-                check=True,
-            )
-        except subprocess.SubprocessError as error:
-            raise BdgsError(f"the graph did not end well ({error}); see '{log}'") from error
 
 
 def live_columns(metrics: Mapping[str, Any]) -> dict[str, Any]:

@@ -92,6 +92,14 @@ class Adjuster:
         with self._busy:
             self._back_end.start_from(readout_s)
 
+    def resume(self, last: StampedPose) -> None:
+        """Go on with the mapper's keyframes; `last` is the newest, as tracking gave it."""
+        self.start_from(self._mapper.readout_s)
+        with self._lock:
+            self._poses = self._mapper.keyframe_poses()
+            self._moves = self._mapper.history.moves_since(last.stamp_ns)
+            self._last = last
+
     def adjust(self, keyframe: Keyframe, tracked: Iterable[StampedPose]) -> Adjustment | None:
         """
         Find out where a new keyframe and the earlier ones are, and tell tracking.

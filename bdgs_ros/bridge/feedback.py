@@ -28,7 +28,7 @@ Item = TypeVar('Item')
 _LABELS_KEPT = 30
 _MODELS_KEPT = 4
 _KEYFRAMES_KEPT = 300
-_ASK_PERIOD_S = 1.0
+_ASK_PERIOD_S = 0.3  # discovery may be under way, and what is said then gets lost
 _ABSENT_S = 1.0
 FIRST_ABSENT_S = 5.0  # the first message can be later than the discovery of its publisher
 
@@ -64,6 +64,8 @@ class Feedback:
         self.loaded_map = ''
         """The file of the map that mapping has loaded at run time and still has."""
         self._is_replaced = False
+        self.goes_on = False
+        """Whether there are poses of a run before, whose map mapping should have."""
         self._request = node.create_publisher(Empty, topics.MAP_REQUEST, topics.RELIABLE)
         node.create_subscription(Bool, topics.LOCALIZATION, self._on_localization, topics.LATCHED)
         node.create_subscription(String, topics.MAP_LOADED, self._on_map_loaded, topics.LATCHED)
@@ -105,13 +107,14 @@ class Feedback:
     @property
     def begins_in_map(self) -> bool:
         """Whether the first frame is to be found in a map that exists."""
-        return self._config.begins_in_map or self._map_is_frozen or bool(self.loaded_map)
+        in_file = self._config.begins_in_map or self._map_is_frozen or bool(self.loaded_map)
+        return in_file or self.goes_on
 
     def entrance(self, camera: PinholeCamera) -> tuple[bool, ModelView | None]:
         """
         Return whether mapping has answered, and the view of its map if it has one.
 
-        Mapping is asked every second until it answers; lockstep waits for the answer.
+        Mapping is asked again and again until it answers; lockstep waits for the answer.
         """
         limit_s = self._config.lockstep_timeout_s if self._config.lockstep else 0.0
         deadline = time.monotonic() + limit_s

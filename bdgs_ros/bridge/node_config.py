@@ -8,6 +8,7 @@ parameters of all nodes and uses its own: one yaml file serves the whole graph.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from bdgs_ros.core.config import (
     BackEndConfig,
@@ -46,6 +47,19 @@ class SyncConfig:
 
 
 @dataclass(frozen=True)
+class JournalConfig:
+    """What a run leaves on the disk while it goes on."""
+
+    enabled: bool = param(True, 'write poses and map down while they come, to go on after a crash')
+    folder: str = param(
+        '', 'where; empty: in output, else in the cache folder (slam_node), or not (other nodes)'
+    )
+    limit_mb: float = param(
+        512.0, 'of the poses, 3 kB a second; the map has limits of its own', unit='MB', low=1.0
+    )
+
+
+@dataclass(frozen=True)
 class GraphConfig:
     """What every node of the graph shares."""
 
@@ -66,6 +80,8 @@ class GraphConfig:
     localization: bool = param(
         False, 'begin in the map of map_file and leave it as it is: localisation alone'
     )
+    resume: bool = param(False, 'go on with the world that the journal holds')
+    journal: JournalConfig = field(default_factory=JournalConfig)
     camera: CameraConfig = field(default_factory=CameraConfig)
     qos: QosConfig = field(default_factory=QosConfig)
     sync: SyncConfig = field(default_factory=SyncConfig)
@@ -79,6 +95,11 @@ class GraphConfig:
     def begins_in_map(self) -> bool:
         """Whether tracking starts in a map that exists."""
         return self.load_at_start or self.localization
+
+    @property
+    def journal_folder(self) -> Path | None:
+        """Where the journal is; None where none is kept."""
+        return Path(self.journal.folder) if self.journal.enabled and self.journal.folder else None
 
 
 @dataclass(frozen=True)
@@ -133,7 +154,6 @@ class MappingNodeConfig(GraphConfig):
     final_trajectory_file: str = param(
         '', 'where bdgs/save_final_trajectory writes; may change at run time'
     )
-    autosave_s: float = param(0.0, 'save map_file this often; 0: never', unit='s', low=0.0)
     render_rate: float = param(
         5.0,
         'of bdgs/rendered, while subscribed and the map grows (frozen: every pose); 0: never',

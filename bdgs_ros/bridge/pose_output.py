@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 
 from geometry_msgs.msg import PoseStamped, Vector3
 from nav_msgs.msg import Odometry, Path
@@ -10,10 +11,13 @@ from rclpy.node import Node
 from sensor_msgs.msg import Image
 
 from bdgs_ros.bridge import conversions, topics
+from bdgs_ros.bridge.health import Health
 from bdgs_ros.bridge.node_config import TrackingNodeConfig
 from bdgs_ros.bridge.optional import TransformPublisher
 from bdgs_ros.core import se3
 from bdgs_ros.core.types import Pose, StampedPose, TrackingResult, Trajectory
+from bdgs_ros.journal.folder import poses_file
+from bdgs_ros.journal.poses import PoseJournal, read_told
 from bdgs_ros.tracking.piece import Piece
 
 _PATH_POSES = 2000
@@ -30,13 +34,22 @@ class PoseOutput:
     node : Node
         It publishes.
     config : TrackingNodeConfig
-        Frame ids and periods.
+        Frame ids and periods; the journal.
+    health : Health
+        Gets what is wrong with the journal.
+
+    Raises
+    ------
+    JournalError
+        If the trajectory shall go on with a journal that is none.
 
     """
 
-    def __init__(self, node: Node, config: TrackingNodeConfig) -> None:
+    def __init__(self, node: Node, config: TrackingNodeConfig, health: Health) -> None:
         self._config = config
         self._poses: list[StampedPose] = []
+        self._previous: StampedPose | None = None  # none after a restart
+        self._journal = self._begin_journal(health)
         self._path_sent_s = 0.0
         self._pose = node.create_publisher(PoseStamped, topics.POSE, topics.RELIABLE)
         self._odometry = node.create_publisher(Odometry, topics.ODOMETRY, topics.RELIABLE)
@@ -50,6 +63,20 @@ class PoseOutput:
         self._move = node.create_publisher(PoseStamped, topics.MOVE, topics.RELIABLE)
         self._transform = TransformPublisher(node, config.publish_tf)
 
+    def _begin_journal(self, health: Health) -> PoseJournal | None:
+        """Go on with the poses of the journal, if that is wanted, and write to it from now on."""
+        folder = self._config.journal_folder
+        if folder is None:
+            return None
+        if self._config.resume:
+            self._poses = read_told(poses_file(folder)).poses
+        return PoseJournal(
+            poses_file(folder),
+            round(1e6 * self._config.journal.limit_mb),
+            partial(health.set_problem, 'journal'),
+            keep=self._config.resume,
+        )
+
     @property
     def trajectory(self) -> Trajectory:
         """The poses published so far."""
@@ -57,10 +84,19 @@ class PoseOutput:
 
     def clear(self) -> None:
         """Forget the trajectory."""
-        self._poses = []
+        self._poses, self._previous = [], None
+        if self._journal is not None:
+            self._journal.restart()
+
+    def close(self) -> None:
+        """Have the last poses written."""
+        if self._journal is not None:
+            self._journal.close()
 
     def publish_move(self, stamp_ns: int, T_new_old: Pose) -> None:
         """Say that the poses from a frame on are in a world that has moved."""
+        if self._journal is not None:
+            self._journal.note_move(stamp_ns, T_new_old)
         self._move.publish(conversions.motion_stamped(T_new_old, stamp_ns, self._config.map_frame))
 
     def publish_piece_keyframe(self, stamp_ns: int) -> None:
@@ -70,6 +106,8 @@ class PoseOutput:
     def publish_piece(self, piece: Piece) -> None:
         """Say where the camera was while it was lost."""
         frame = self._config.map_frame
+        if self._journal is not None:
+            self._journal.note_piece(piece.poses)
         self._piece.publish(conversions.path_message(piece.poses, piece.poses[-1].stamp_ns, frame))
 
     def wait_for_mapping(self, patience_s: float) -> None:
@@ -81,8 +119,13 @@ class PoseOutput:
     def publish(self, result: TrackingResult, image_frame: str) -> None:
         """Publish the pose of a frame that was tracked."""
         child = self._config.camera_frame or image_frame
-        previous = self._poses[-1] if self._poses else None
-        self._poses.append(StampedPose(result.stamp_ns, result.T_world_camera))
+        previous, self._previous = (
+            self._previous,
+            StampedPose(result.stamp_ns, result.T_world_camera),
+        )
+        self._poses.append(self._previous)
+        if self._journal is not None:
+            self._journal.note_pose(result.stamp_ns, result.T_world_camera)
         pose = conversions.pose_stamped(
             result.T_world_camera, result.stamp_ns, self._config.map_frame
         )

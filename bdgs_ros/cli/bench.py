@@ -17,7 +17,10 @@ from bdgs_ros.eval.metric import dump_json
 NAME = 'bench'
 HELP = 'measure accuracy or speed; finished cells are kept, so an interrupted bench goes on'
 
-_BENCHES = ('slam', 'accuracy', 'belief', 'mapping', 'tracking', 'recovery', 'rasterizer', 'card')
+_BENCHES = (
+    *('slam', 'accuracy', 'belief', 'mapping', 'tracking', 'recovery', 'faults'),
+    *('rasterizer', 'card'),
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

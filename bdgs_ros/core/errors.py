@@ -21,5 +21,9 @@ class MapError(BdgsError):
     """A Gaussian map cannot be loaded, saved or used."""
 
 
+class JournalError(BdgsError):
+    """What a run left while it went on cannot be read or gone on with."""
+
+
 class EvaluationError(BdgsError):
     """Two trajectories or images cannot be compared."""

@@ -24,8 +24,9 @@ def write_aside(path: Path, write: Callable[[Path], None]) -> None:
     aside = path.with_name(f'.{path.stem}.part{path.suffix}')
     try:
         write(aside)
-        _flush(aside)
+        flush(aside)
         aside.replace(path)
+        flush(path.parent)
     finally:
         aside.unlink(missing_ok=True)
 
@@ -67,8 +68,8 @@ def write_folder_aside(
         remove_folder(aside)
         aside.mkdir()
         fill(aside)
-        for path in aside.rglob('*'):
-            _flush(path)
+        for path in (aside, *aside.rglob('*')):
+            flush(path)
         _swap(aside, folder, previous, then)
     finally:
         remove_folder(aside)
@@ -100,8 +101,10 @@ def _swap(new: Path, folder: Path, previous: Path, then: Callable[[], None]) -> 
         raise
 
 
-def _flush(path: Path) -> None:
-    """Bring the content to the disk before the name: a power cut must not leave it empty."""
-    if path.is_file():
-        with path.open('rb+') as file:
-            os.fsync(file.fileno())
+def flush(path: Path) -> None:
+    """Bring a file's content, or the names in a folder, to the disk, for when the power fails."""
+    descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -16,10 +16,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from filterpy.kalman import predict as kalman_predict
-from filterpy.kalman import update as kalman_update
 from numpy.typing import NDArray
 
+from bdgs_ros.core import kalman
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.config.detection import TracksConfig
 from bdgs_ros.core.types import Detection, Pose
@@ -219,7 +218,7 @@ class ObjectTracks:
         if dt <= 0:
             return list(self.tracks)
         F, Q = transition(dt, self._config)
-        moved = (kalman_predict(t.state, t.covariance, F, Q) for t in self.tracks)
+        moved = (kalman.predict(t.state, t.covariance, F, Q) for t in self.tracks)
         return [
             replace(t, state=state, covariance=covariance, stamp_ns=stamp_ns)
             for t, (state, covariance) in zip(self.tracks, moved, strict=True)
@@ -227,7 +226,7 @@ class ObjectTracks:
 
     def _corrected(self, track: Track, sighting: Sighting, T_odom_camera: Pose) -> Track:
         m = measurement(sighting, T_odom_camera, self._config)
-        state, covariance = kalman_update(track.state, track.covariance, m.z, m.R, m.H)
+        state, covariance = kalman.update(track.state, track.covariance, m.z, m.R, m.H)
         odds = min(track.odds * self._evidence(sighting.detection.score), self._config.most_odds)
         return replace(
             track,

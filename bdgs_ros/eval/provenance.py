@@ -8,7 +8,7 @@ import subprocess
 from importlib import metadata
 from pathlib import Path
 
-_PACKAGES = ('numpy', 'torch', 'opencv-python-headless', 'onnxruntime', 'rosbags', 'filterpy')
+_PACKAGES = ('numpy', 'torch', 'opencv-python-headless', 'onnxruntime', 'rosbags')
 
 
 def commit() -> str:

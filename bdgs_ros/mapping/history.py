@@ -79,6 +79,14 @@ class History:
         self._moves, self._joined = [], []
 
     @property
+    def newest(self) -> StampedPose | None:
+        """The newest keyframe of this run, as tracking gave it."""
+        if not self._anchors:
+            return None
+        stamp_ns = max(self._anchors)
+        return StampedPose(stamp_ns, self._anchors[stamp_ns].online)
+
+    @property
     def poses(self) -> dict[int, Pose]:
         """`T_world_camera` of this run's keyframes by stamp (ns), as they are now."""
         return {stamp_ns: anchor.final for stamp_ns, anchor in self._anchors.items()}
@@ -100,6 +108,25 @@ class History:
     def note_move(self, stamp_ns: int, T_new_old: Pose) -> None:
         """Note that tracking moved everything before a frame: it learnt where keyframes are."""
         self._moves.append((stamp_ns, T_new_old))
+
+    def catch_up(
+        self,
+        since_ns: int,
+        moves: Sequence[StampedPose],
+        pieces: Sequence[Sequence[StampedPose]],
+    ) -> None:
+        """Take what tracking said after a frame, some of it while nobody heard."""
+        told = {move.stamp_ns: move.T_world_camera for move in moves if move.stamp_ns > since_ns}
+        known = [move for move in self._moves if move[0] not in told]
+        self._moves = sorted((*known, *told.items()), key=itemgetter(0))
+        joined = {pose.stamp_ns for pose in self._joined}
+        for piece in pieces:
+            if piece and piece[0].stamp_ns not in joined:
+                self.join(piece)
+
+    def moves_since(self, stamp_ns: int) -> list[Move]:
+        """Return by what tracking moved its world after a frame."""
+        return [move for move in self._moves if move[0] > stamp_ns]
 
     def join(self, poses: Sequence[StampedPose]) -> None:
         """Take the frames of a piece of map that was placed in the world after it was made."""

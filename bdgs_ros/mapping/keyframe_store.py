@@ -58,6 +58,8 @@ class KeyframeSet:
     next_index: int = 0
     readout_s: float | None = None
     """Of the camera's rolling shutter; the images of the keyframes are without it."""
+    index_of: Mapping[int, int] = field(default_factory=dict)
+    """By stamp, of all keyframes of the run: Gaussians know which one brought them."""
 
 
 def write_keyframes(folder: Path, kept: KeyframeSet, gaussians: int) -> None:
@@ -79,10 +81,15 @@ def write_keyframes(folder: Path, kept: KeyframeSet, gaussians: int) -> None:
         If something cannot be written.
 
     """
-    for kind in _KINDS.values():
-        (folder / kind).mkdir()
-    frames = [_write_frame(folder, keyframe) for keyframe in kept.keyframes]
-    document = {
+    for keyframe in kept.keyframes:
+        write_images(folder, images_of(keyframe))
+    document = document_of(kept, gaussians)
+    (folder / TRANSFORMS).write_text(json.dumps(document, indent=1) + '\n', encoding='utf-8')
+
+
+def document_of(kept: KeyframeSet, gaussians: int) -> dict[str, Any]:
+    """Return what `transforms.json` says; see `write_keyframes`."""
+    return {
         'camera_model': 'OPENCV',  # of the names for a pinhole the one that all readers know
         'depth_unit_scale_factor': 1 / _MM_PER_M,
         'ply_file_path': 'points.ply',
@@ -94,13 +101,14 @@ def write_keyframes(folder: Path, kept: KeyframeSet, gaussians: int) -> None:
             'vignette': list(kept.vignette.coefficients),
             'depth_bend': list(kept.depth_bend.coefficients),
             'readout_s': kept.readout_s,
+            'index_of': {str(stamp_ns): index for stamp_ns, index in kept.index_of.items()},
         },
-        'frames': frames,
+        'frames': [_frame_of(keyframe) for keyframe in kept.keyframes],
     }
-    (folder / TRANSFORMS).write_text(json.dumps(document, indent=1) + '\n', encoding='utf-8')
 
 
-def _write_frame(folder: Path, keyframe: MapKeyframe) -> dict[str, Any]:
+def images_of(keyframe: MapKeyframe) -> dict[str, NDArray[Any]]:
+    """Return the images of a keyframe as they are stored, by their paths in the folder."""
     finest = keyframe.levels[0]
     images: dict[str, NDArray[Any]] = {
         'file_path': finest.image[..., ::-1],
@@ -108,16 +116,31 @@ def _write_frame(folder: Path, keyframe: MapKeyframe) -> dict[str, Any]:
         'mask_path': np.where(finest.static, 255, 0).astype(np.uint8),
         'dynamic_file_path': keyframe.p_dynamic,
     }
-    paths = {key: f'{_KINDS[key]}/{keyframe.index:06d}.png' for key in images}
-    for key, image in images.items():
-        _write_png(folder / paths[key], image)
+    paths = _paths(keyframe)
+    return {paths[key]: image for key, image in images.items()}
+
+
+def write_images(folder: Path, images: Mapping[str, NDArray[Any]]) -> None:
+    """Write images by their paths in a folder; `OSError` if one cannot be written."""
+    for name, image in images.items():
+        path = folder / name
+        path.parent.mkdir(exist_ok=True)
+        _write_png(path, image)
+
+
+def _paths(keyframe: MapKeyframe) -> dict[str, str]:
+    return {key: f'{kind}/{keyframe.index:06d}.png' for key, kind in _KINDS.items()}
+
+
+def _frame_of(keyframe: MapKeyframe) -> dict[str, Any]:
     return {
-        **paths,
-        **_intrinsics(finest.camera),
+        **_paths(keyframe),
+        **_intrinsics(keyframe.levels[0].camera),
         'transform_matrix': (keyframe.T_world_camera @ _TO_OPENGL).tolist(),
         'stamp_ns': int(keyframe.stamp_ns),
         'keyframe_index': int(keyframe.index),
         'exposure': [float(value) for value in keyframe.exposure],
+        'depth_bend': list(keyframe.depth_bend),
     }
 
 
@@ -169,7 +192,11 @@ def read_keyframes(folder: Path, levels: int) -> KeyframeSet:
         If the folder was not written by us, or a file of it is missing or does not fit.
 
     """
-    document = _read_document(folder)
+    return keyframes_from(_read_document(folder), folder, levels)
+
+
+def keyframes_from(document: Mapping[str, Any], folder: Path, levels: int) -> KeyframeSet:
+    """Return the keyframes that a document names, with their images; see `read_keyframes`."""
     own = document['bdgs']
     try:
         vignette = Vignette(*map(float, own['vignette']))
@@ -177,9 +204,11 @@ def read_keyframes(folder: Path, levels: int) -> KeyframeSet:
         entries = document['frames']
         keyframes = [_read_frame(folder, entry, levels, vignette) for entry in entries]
         history = History.from_document(own['history'])
-        for keyframe in keyframes:
-            keyframe.depth_bend = depth_bend.coefficients
+        for keyframe, entry in zip(keyframes, entries, strict=True):
+            held = entry.get('depth_bend', depth_bend.coefficients)
+            keyframe.depth_bend = tuple(map(float, held))
         next_index = int(own['next_index'])
+        index_of = {int(s): int(index) for s, index in own.get('index_of', {}).items()}
         readout = own.get('readout_s')
         readout_s = None if readout is None else float(readout)
     except (KeyError, TypeError, ValueError) as error:
@@ -189,7 +218,7 @@ def read_keyframes(folder: Path, levels: int) -> KeyframeSet:
         ) from error
     newest = max((keyframe.index for keyframe in keyframes), default=-1)
     count = max(next_index, newest + 1)
-    return KeyframeSet(keyframes, history, vignette, depth_bend, count, readout_s)
+    return KeyframeSet(keyframes, history, vignette, depth_bend, count, readout_s, index_of)
 
 
 def _read_document(folder: Path) -> dict[str, Any]:

@@ -502,18 +502,22 @@ class Mapper:
             If something cannot be written; the old files are still there then.
 
         """
-        self.history.refresh(self.keyframes)
         for keyframe in self.keyframes:
             self.depth_bend.renew(keyframe)
-        kept = KeyframeSet(
+        save_map(Path(path), self.map, self.kept() if keyframes else None)
+
+    def kept(self) -> KeyframeSet:
+        """Return what belongs to the map beside its Gaussians."""
+        self.history.refresh(self.keyframes)
+        return KeyframeSet(
             self.keyframes,
             self.history,
             self.vignette,
             self.depth_bend,
             self._count,
             self.readout_s,
+            self._index_of,
         )
-        save_map(Path(path), self.map, kept if keyframes else None)
 
     def load(self, path: Path) -> None:
         """
@@ -528,13 +532,18 @@ class Mapper:
         loaded, kept = load_map(
             Path(path), self._belief, self._config.pyramid.levels, self._config.color.degree
         )
+        self.take(loaded, replace(kept, index_of={}))
+
+    def take(self, gaussians: GaussianMap, kept: KeyframeSet) -> None:
+        """Go on with a map as if it had grown here."""
         self.reset()
-        self.map = loaded
+        self.map = gaussians
         self.keyframes = list(kept.keyframes)
         self.history, self.vignette = kept.history, kept.vignette
         self.depth_bend = kept.depth_bend
         self.readout_s = kept.readout_s
         self._count = kept.next_index
+        self._index_of = dict(kept.index_of)
 
 
 def _to_probability_image(p_dynamic: NDArray[np.float32]) -> ProbabilityImage:

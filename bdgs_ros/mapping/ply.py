@@ -68,15 +68,20 @@ def save_ply(path: Path, gaussians: GaussianMap, *, state: bool = True) -> None:
         If the file cannot be written.
 
     """
+    try:
+        write_bytes(path, *ply_content(gaussians, state=state))
+    except OSError as error:
+        raise MapError(f"map not saved to '{path}': {error.strerror or error}") from error
+
+
+def ply_content(gaussians: GaussianMap, *, state: bool = True) -> tuple[bytes, bytes]:
+    """Return header and rows of the file, see `save_ply`."""
     blocks = _standard_blocks(gaussians) + (_state_blocks(gaussians) if state else [])
     names = [name for block_names, _ in blocks for name in block_names]
     columns = [array.reshape(len(gaussians), len(names_of)) for names_of, array in blocks]
     table = np.concatenate(columns, axis=1, dtype=np.float32)
     header = _header(len(gaussians), [f'float {name}' for name in names])
-    try:
-        write_bytes(path, header, table.astype('<f4').tobytes())
-    except OSError as error:
-        raise MapError(f"map not saved to '{path}': {error.strerror or error}") from error
+    return header, table.astype('<f4').tobytes()
 
 
 def _header(count: int, properties: list[str]) -> bytes:

@@ -14,6 +14,7 @@ from bdgs_ros.bridge.frames import FrameDecoder, RawFrame
 from bdgs_ros.bridge.health import Health
 from bdgs_ros.bridge.map_output import MapOutput
 from bdgs_ros.bridge.model_view import ModelPublisher
+from bdgs_ros.core import se3
 from bdgs_ros.core.errors import BdgsError
 from bdgs_ros.core.types import NO_KEYFRAME_NS, Pose
 from bdgs_ros.mapping.entrance import check_entrance, entrance
@@ -42,6 +43,9 @@ class MapEntrance:
         Of the view at most, in pixels.
     put : callable
         Has a task done by the thread that may use the map.
+    note_move : callable
+        Called with a stamp and `T_new_old` where tracking comes in again: it was in a world as
+        that was before corrections that it has not heard of.
 
     """
 
@@ -55,6 +59,7 @@ class MapEntrance:
         health: Health,
         width: int,
         put: Callable[[Callable[[], None]], None],
+        note_move: Callable[[int, Pose], None],
     ) -> None:
         self._node = node
         self._live = live
@@ -64,8 +69,10 @@ class MapEntrance:
         self._health = health
         self._width = width
         self._put = put
+        self._note_move = note_move
         self._newest: RawFrame | None = None
         self._is_asked = False
+        self._left_ns: int | None = None  # the last frame before tracking came in again
         node.create_subscription(
             Empty, topics.MAP_REQUEST, lambda _: self._on_request(), topics.RELIABLE
         )
@@ -108,5 +115,11 @@ class MapEntrance:
 
     def _where_it_starts(self) -> Pose:
         """Return where the camera was last, if tracking asks because it was restarted."""
-        poses = self._live.poses
-        return poses[-1].T_world_camera if poses else self._live.start_pose
+        if not self._live.poses:
+            return self._live.start_pose
+        last = self._live.poses[-1]
+        now = self._live.mapper.final_pose(last.stamp_ns, last.T_world_camera)
+        if last.stamp_ns != self._left_ns:  # it may ask twice
+            self._left_ns = last.stamp_ns
+            self._note_move(last.stamp_ns + 1, now @ se3.inverse(last.T_world_camera))
+        return now

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -51,7 +50,7 @@ class MapServices:
     node : GraphNode
         Its parameters say which files; it publishes.
     config : MappingNodeConfig
-        How often the map is saved without being asked.
+        What it begins with.
     health : Health
         Published with what is saved.
     live : LiveMap
@@ -78,7 +77,6 @@ class MapServices:
         self._live = live
         self._settle = settle
         self._on_loaded = on_loaded
-        self._saved = (0, time.monotonic())
         self._localization = node.create_publisher(Bool, topics.LOCALIZATION, topics.LATCHED)
         self._loaded = node.create_publisher(String, topics.MAP_LOADED, topics.LATCHED)
         # A service waits for the keyframe at hand; meanwhile images must still be taken.
@@ -113,14 +111,6 @@ class MapServices:
         """Return where the map is saved and loaded; raises `ConfigError` if nobody said so."""
         return self._file('map_file', 'where?')
 
-    def save_if_due(self) -> None:
-        """Save the map if it has changed and was not saved for a time."""
-        period_s = self._config.autosave_s
-        version, saved_s = self._saved
-        due = self._live.version != version and time.monotonic() - saved_s >= period_s
-        if period_s and due:
-            self._save()
-
     def withdraw(self) -> None:
         """Say that the map is of no file any more: it was forgotten."""
         self._loaded.publish(String())
@@ -140,14 +130,10 @@ class MapServices:
 
     def _on_save(self) -> str:
         self._settle()  # keyframes that have arrived belong into the file
-        return self._save()
-
-    def _save(self) -> str:
         file = self.map_file()
         with self._live.lock:
             self._live.mapper.save(file)
             count = len(self._live.mapper.map)
-        self._saved = (self._live.version, time.monotonic())
         self._health.publish()
         return f"{count} Gaussians in '{file}'"
 

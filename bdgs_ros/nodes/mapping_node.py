@@ -44,6 +44,7 @@ from bdgs_ros.core.types import (
 )
 from bdgs_ros.mapping.mapper import Mapper
 from bdgs_ros.nodes.map_entrance import MapEntrance
+from bdgs_ros.nodes.map_journal import MapJournal
 from bdgs_ros.nodes.map_pieces import MapPieces
 from bdgs_ros.nodes.map_services import AT_RUN_TIME, LiveMap, MapServices
 from bdgs_ros.pipeline import Adjustment
@@ -107,11 +108,24 @@ class MappingNode(GraphNode):
         )
         self._entrance = MapEntrance(
             self, self._live, self._decoder, self._models, self._output, self._health,
-            config.mapping.width, self._worker.put,
+            config.mapping.width, self._worker.put, self._note_motion,
         )  # fmt: skip
+        self._journal = MapJournal(config, self._live, self._health)
         self._subscribe()
         self._map_services.start()
+        self._take_up()
         self.get_logger().info(f'mapping is ready: mode {config.mode}')
+
+    def _take_up(self) -> None:
+        """Go on with what a run before has left, if that is wanted."""
+        last = self._journal.begin()
+        if last is not None:
+            self._back_end.resume(last)
+            self._publish_keyframes(self._mapper.keyframe_poses())
+            self.get_logger().info(
+                f'going on with {len(self._live.poses)} poses and {len(self._mapper.map)} '
+                'Gaussians of the journal'
+            )
 
     def results(self) -> list[Callable[[], str]]:
         """Return what saves the final trajectory and the map."""
@@ -167,8 +181,12 @@ class MappingNode(GraphNode):
     def _note_move(self, message: PoseStamped) -> None:
         if self._live.is_entered:
             T_new_old = conversions.motion_from_message(message)
-            self._mapper.history.note_move(conversions.stamp_ns(message), T_new_old)
-            self._back_end.note_move(conversions.stamp_ns(message), T_new_old)
+            self._note_motion(conversions.stamp_ns(message), T_new_old)
+
+    def _note_motion(self, stamp_ns: int, T_new_old: Pose) -> None:
+        """Take by what the world was moved, for tracking, before a frame."""
+        self._mapper.history.note_move(stamp_ns, T_new_old)
+        self._back_end.note_move(stamp_ns, T_new_old)
 
     def _queue_keyframe(self, message: PoseStamped) -> None:
         stamp_ns = conversions.stamp_ns(message)
@@ -242,6 +260,7 @@ class MappingNode(GraphNode):
             with self._health.timed('mapping'), self._lock:
                 answered = self._back_end.into_map(keyframe, adjustment)
                 self._live.version += 1
+                self._journal.keep()
         except BdgsError as error:
             self._health.error(error)
         if not answered:
@@ -333,13 +352,13 @@ class MappingNode(GraphNode):
         return self._labels.nearest(stamp_ns, _MAX_LABEL_AGE_NS, wait_s if present else 0.0)
 
     def _on_idle(self) -> None:
-        """Between keyframes: show the map, and save it if that is due."""
+        """Between keyframes: show the map."""
         with self._lock:
             shown = self._shed < Shed.RENDERS or self._mapper.frozen
             more_to_render = shown and self._output.render(self._mapper)
             self._output.publish_map(self._mapper, self._live.version, self._config.belief.margin)
             more_to_polish = self._polish()
-        self._map_services.save_if_due()
+            self._journal.keep()
         if more_to_render or more_to_polish:
             self._worker.wake()
 
@@ -367,10 +386,12 @@ class MappingNode(GraphNode):
                 self._mapper.reset()
                 self._live.version += 1
                 self._map_services.withdraw()
+                self._journal.forget()
         self._output.forget()
 
     def _settle(self) -> None:
         self._worker.wait_idle(_PENDING_S)
+        self._journal.catch_up()
 
     def _on_loaded(self) -> None:
         """Give up what belongs to the world before; the mapper is locked and has another map."""
@@ -379,6 +400,7 @@ class MappingNode(GraphNode):
         self._tracked.clear()
         self._back_end.start_from(self._mapper.readout_s)
         self._output.forget()
+        self._journal.forget()
         self._publish_keyframes({})
 
     def close(self) -> None:
@@ -386,6 +408,7 @@ class MappingNode(GraphNode):
         self._map_services.stop()
         self._adjusting.stop()
         self._worker.stop()
+        self._journal.close()
 
 
 def _mapping_config(config: MappingNodeConfig) -> MappingConfig:

@@ -25,8 +25,9 @@ from bdgs_ros.bridge.priority import may_go_first
 from bdgs_ros.bridge.processes import Child, Children, forwarded_arguments
 from bdgs_ros.bridge.runner import REFUSED, GraphNode, run
 from bdgs_ros.core.config import BdgsConfig, specs, with_values
-from bdgs_ros.core.errors import BdgsError, ConfigError
+from bdgs_ros.core.errors import BdgsError, ConfigError, JournalError
 from bdgs_ros.core.types import Trajectory
+from bdgs_ros.journal.folder import Claim, in_cache
 from bdgs_ros.nodes.in_process import InProcessNodes
 
 _GRAPH = {
@@ -59,7 +60,9 @@ class SlamNode(GraphNode):
         self._values = {name: p.value for name, p in self._parameter_overrides.items()}
         self._slam_config = check_everything(self._config, self._values)
         self._files = self._result_files()
+        self._journal = self._claim_journal()
         self._started_s = time.time()
+        self._is_over = False
         self._observer = GraphObserver(self)
         self._savers = {
             name: self.create_client(Trigger, name) for name in self._results_to_save()
@@ -73,8 +76,24 @@ class SlamNode(GraphNode):
             _WATCH_PERIOD_S, self._watch, clock=Clock(clock_type=ClockType.STEADY_TIME)
         )
 
+    def _claim_journal(self) -> Claim | None:
+        """Take the folder that all nodes of this graph keep their journal in."""
+        config = self._config
+        if not config.journal.enabled:
+            return None
+        named = config.journal.folder or (config.output and str(Path(config.output) / 'journal'))
+        try:
+            return Claim([Path(named).resolve()] if named else in_cache(), keep=config.resume)
+        except JournalError as error:
+            if named or config.resume:
+                raise
+            self.get_logger().warning(f'no journal is kept: {error}')
+            return None
+
     def _start_graph(self) -> None:
         values = {**self._values, **self._files}
+        if self._journal is not None:
+            values['journal.folder'] = str(self._journal.folder)
         for name, kind in _GRAPH.items():
             if self._config.processes == 'several':
                 self._children.start(name, values)
@@ -162,21 +181,14 @@ class SlamNode(GraphNode):
             f'{child.name} ended with status {status}; starting it again '
             f'({child.respawns} of {self._config.respawns})'
         )
-        values = dict(child.values)
-        if child.name == 'mapping_node' and self._has_saved_map(values):
-            values['load_at_start'] = True
-        if child.name == 'tracking_node':  # mapping shows it the map from where it was last
-            values['load_at_start'] = True
-        self._children.start(child.name, values)
-
-    def _has_saved_map(self, values: dict[str, object]) -> bool:
-        file = Path(str(values.get('map_file', '')))
-        return file.is_file() and file.stat().st_mtime >= self._started_s
+        self._children.start(child.name, {**child.values, 'resume': True})
 
     def _conclude(self, status: int) -> None:
         """Write the results, in a thread: the answers of the services come to the executor."""
         saves = [*(partial(self._call, name) for name in self._savers), self._write_metrics]
         saved = [self._succeeds(save) for save in saves]
+        # Of a recording that is over and saved there is nothing to go on with.
+        self._is_over = all(saved) and self._replay_report.is_file()
         self.finish(status or int(not all(saved)))
 
     def _succeeds(self, save: Callable[[], None]) -> bool:
@@ -240,6 +252,8 @@ class SlamNode(GraphNode):
         """End the graph."""
         self._children.stop()
         self._threads.stop()
+        if self._journal is not None and self._is_over:
+            self._journal.remove()
 
 
 def check_everything(config: SlamConfig, values: dict[str, Any]) -> BdgsConfig:

@@ -30,6 +30,8 @@ from bdgs_ros.core.images import fitted, halved
 from bdgs_ros.core.threads import one_thread_in_cv2
 from bdgs_ros.core.types import Keyframe, Labels, RgbdFrame, TrackingResult, TrackingStatus
 from bdgs_ros.data.trajectory_io import write_trajectory
+from bdgs_ros.journal.checkpoints import read_places
+from bdgs_ros.journal.folder import map_folder
 from bdgs_ros.mapping.map_files import load_places
 from bdgs_ros.tracking.camera_tracker import CameraTracker
 from bdgs_ros.tracking.piece import Explorer, Piece
@@ -57,7 +59,7 @@ class TrackingNode(GraphNode):
         self._registration = RegistrationWatch(config.tracking.registration)
         self._newest: RgbdFrame | None = None  # to measure that by
         self._joined: list[Piece] = []  # that mapping is to hear of
-        self._output = PoseOutput(self, config)
+        self._output = PoseOutput(self, config, self._health)
         self._status = self.create_publisher(DiagnosticArray, topics.STATUS, topics.RELIABLE)
         self._offset = self.create_publisher(Float64, topics.DEPTH_OFFSET, topics.LATCHED)
         self._reset_event = self.create_publisher(Empty, topics.RESET_EVENT, topics.RELIABLE)
@@ -77,6 +79,7 @@ class TrackingNode(GraphNode):
         serve_switch(self, topics.PAUSE, self._on_pause)
         serve_trigger(self, topics.SAVE_TRAJECTORY, self._on_save)
         self._source = FrameSource(self, config, self._health, self._put, self._forget)
+        self._feedback.goes_on = bool(len(self._output.trajectory))
         self.get_logger().info(f'tracking is ready: mode {config.mode}')
 
     def _put(self, raw: RawFrame) -> None:
@@ -128,11 +131,19 @@ class TrackingNode(GraphNode):
             if view is not None:
                 self._tracker.start_from(view, self._places())
                 self._explorer.reset(is_known=True)
+            elif self._feedback.goes_on:
+                self.get_logger().warning(
+                    'there is no map left of the world that the trajectory is in: another begins'
+                )
+                self._output.clear()
         self._has_begun = True
         return True
 
     def _places(self) -> list[Keyframe]:
-        """Read the keyframes of the map that mapping has loaded: the camera may be anywhere."""
+        """Read the keyframes of the map that mapping has: the camera may be anywhere in it."""
+        folder = self._config.journal_folder
+        if self._feedback.goes_on and folder is not None:
+            return read_places(map_folder(folder))
         begun = str(self.get_parameter('map_file').value) if self._config.begins_in_map else ''
         file = self._feedback.loaded_map or begun
         if not file:
@@ -275,6 +286,7 @@ class TrackingNode(GraphNode):
         self._joined = []
         self._has_begun = False
         self._feedback.clear()
+        self._feedback.goes_on = False
         self._output.clear()
 
     def _on_reset(self) -> str:
@@ -303,6 +315,7 @@ class TrackingNode(GraphNode):
     def close(self) -> None:
         """Stop working."""
         self._worker.stop()
+        self._output.close()
 
 
 def main(args: list[str] | None = None) -> int:

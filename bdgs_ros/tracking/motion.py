@@ -13,10 +13,9 @@ import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
-from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
-from bdgs_ros.core import se3
+from bdgs_ros.core import kalman, se3
 from bdgs_ros.core.config.tracking import MotionConfig
 from bdgs_ros.core.types import Pose
 
@@ -28,6 +27,7 @@ _START_SPEED = 0.5  # m/s, standard deviation of the velocity while nothing is k
 _START_SPIN = 1.0  # rad/s
 _LATELY_S = 0.5
 _USUAL_DEPTH_M = 3.0  # of the rooms that people carry cameras through
+_POSE_ALONE = np.eye(6, 12)  # is measured, not the velocity
 _LEAST_VARIANCE = 1e-10  # of a measurement, so that the innovation can be inverted
 
 
@@ -230,13 +230,12 @@ class MotionPredictor:
         return outside
 
     def _correct(self, predicted: _State, innovation: Matrix, noise: Matrix) -> _State:
-        """Update with filterpy, then fold the pose error into the pose."""
-        kalman = KalmanFilter(dim_x=12, dim_z=6)
-        kalman.x = np.concatenate([np.zeros(6), predicted.velocity])
-        kalman.P = predicted.covariance
-        kalman.H = np.hstack([np.eye(6), np.zeros((6, 6))])
-        kalman.update(innovation, R=noise)
-        pose = se3.orthonormalise(predicted.T_world_camera @ se3.exp(kalman.x[:6]))
-        velocity = kalman.x[6:] if self._config.model == 'kalman' else np.zeros(6)
-        covariance = 0.5 * (kalman.P + kalman.P.T)
+        """Update the error state, then fold the pose error into the pose."""
+        state = np.concatenate([np.zeros(6), predicted.velocity])
+        state, covariance = kalman.update(
+            state, predicted.covariance, innovation, noise, _POSE_ALONE
+        )
+        pose = se3.orthonormalise(predicted.T_world_camera @ se3.exp(state[:6]))
+        velocity = state[6:] if self._config.model == 'kalman' else np.zeros(6)
+        covariance = 0.5 * (covariance + covariance.T)
         return replace(predicted, T_world_camera=pose, velocity=velocity, covariance=covariance)

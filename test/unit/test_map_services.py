@@ -86,7 +86,7 @@ def test_a_loaded_map_is_another_world_until_tracking_asks_for_it(served: Simple
     assert not served.live.is_entered
     assert se3.log(served.live.start_pose) == pytest.approx([1, 2, 3, 0, 0, 0])
     assert [m.data for m in served.node.sent[topics.MAP_LOADED]] == [str(served.file)]
-    MapEntrance(served.node, served.live, None, None, None, None, 320, None)
+    MapEntrance(served.node, served.live, None, None, None, None, 320, None, None)
     served.node.callbacks[topics.MAP_REQUEST](None)
     assert served.live.is_entered
 
