@@ -19,6 +19,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from bdgs_ros.bridge import transport
+from bdgs_ros.bridge.leftovers import remove_leftovers
 from bdgs_ros.bridge.priority import give_way, go_first
 from bdgs_ros.core.errors import BdgsError
 
@@ -113,6 +114,7 @@ def run(
     follow_parent()
     stop = _catch_signals()
     faulthandler.register(STACKS_SIGNAL)
+    removed = remove_leftovers()
     transport.configure()
     rclpy.init(
         args=args if args is not None else sys.argv,
@@ -120,6 +122,10 @@ def run(
     )
     node: GraphNode | None = None
     try:
+        if removed:
+            get_logger('bdgs_ros').info(
+                f'removed {removed / 1e6:.0f} MB that killed processes had left in shared memory'
+            )
         node = factory()
         _settle_garbage()
         give_way(node.nice)

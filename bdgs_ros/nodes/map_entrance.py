@@ -72,6 +72,8 @@ class MapEntrance:
         self._note_move = note_move
         self._newest: RawFrame | None = None
         self._is_asked = False
+        self.is_waited_for = False
+        """Whether tracking waits for the answer."""
         self._left_ns: int | None = None  # the last frame before tracking came in again
         node.create_subscription(
             Empty, topics.MAP_REQUEST, lambda _: self._on_request(), topics.RELIABLE
@@ -93,7 +95,7 @@ class MapEntrance:
 
     def _answer(self) -> None:
         if self._is_asked and self._newest is not None:
-            self._is_asked = False
+            self._is_asked, self.is_waited_for = False, True
             self._put(partial(self._show, self._newest))
 
     def _show(self, raw: RawFrame) -> None:
@@ -111,6 +113,7 @@ class MapEntrance:
         except BdgsError as error:
             self._health.error(error)
         finally:  # an empty answer says that there is no map
+            self.is_waited_for = False
             self._models.publish(NO_KEYFRAME_NS, view)
 
     def _where_it_starts(self) -> Pose:

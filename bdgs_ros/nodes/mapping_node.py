@@ -301,7 +301,7 @@ class MappingNode(GraphNode):
         if self._config.lockstep:
             return False
         next_ = self._adjusting.unfinished + self._worker.waiting
-        return next_ > 0 or self._shed >= Shed.ITERATIONS
+        return next_ > 0 or self._shed >= Shed.ITERATIONS or self._entrance.is_waited_for
 
     def _wait_frame(self, stamp_ns: int) -> RawFrame | None:
         """Wait for images; in real time some are lost on the way, and the next keyframe waits."""

@@ -19,6 +19,7 @@ from rclpy.clock_type import ClockType
 from std_srvs.srv import Trigger
 
 from bdgs_ros.bridge import parameters, topics
+from bdgs_ros.bridge.leftovers import remove_leftovers
 from bdgs_ros.bridge.node_config import NODE_CONFIGS, SlamConfig, TrackingNodeConfig
 from bdgs_ros.bridge.observer import GraphObserver
 from bdgs_ros.bridge.priority import may_go_first
@@ -252,6 +253,7 @@ class SlamNode(GraphNode):
         """End the graph."""
         self._children.stop()
         self._threads.stop()
+        remove_leftovers()
         if self._journal is not None and self._is_over:
             self._journal.remove()
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from std_msgs.msg import Empty, Float64
 
@@ -25,7 +27,7 @@ from bdgs_ros.bridge.runner import GraphNode, run
 from bdgs_ros.bridge.services import serve_switch, serve_trigger
 from bdgs_ros.bridge.status import FrameState, FrameStatus, status_to_message
 from bdgs_ros.bridge.worker import Worker
-from bdgs_ros.core.errors import ConfigError, DatasetError, MapError
+from bdgs_ros.core.errors import BdgsError, ConfigError, DatasetError, MapError
 from bdgs_ros.core.images import fitted, halved
 from bdgs_ros.core.threads import one_thread_in_cv2
 from bdgs_ros.core.types import Keyframe, Labels, RgbdFrame, TrackingResult, TrackingStatus
@@ -59,6 +61,7 @@ class TrackingNode(GraphNode):
         self._registration = RegistrationWatch(config.tracking.registration)
         self._newest: RgbdFrame | None = None  # to measure that by
         self._joined: list[Piece] = []  # that mapping is to hear of
+        self._late_places: list[Keyframe] = []  # that the tracker does not know yet
         self._output = PoseOutput(self, config, self._health)
         self._status = self.create_publisher(DiagnosticArray, topics.STATUS, topics.RELIABLE)
         self._offset = self.create_publisher(Float64, topics.DEPTH_OFFSET, topics.LATCHED)
@@ -129,7 +132,12 @@ class TrackingNode(GraphNode):
             if not answered:
                 return False
             if view is not None:
-                self._tracker.start_from(view, self._places())
+                if self._feedback.goes_on and not self._config.lockstep:
+                    # It is most likely where it was last: the rest can come later.
+                    self._tracker.start_from(view)
+                    threading.Thread(target=self._read_places, daemon=True).start()
+                else:
+                    self._tracker.start_from(view, self._places())
                 self._explorer.reset(is_known=True)
             elif self._feedback.goes_on:
                 self.get_logger().warning(
@@ -138,6 +146,17 @@ class TrackingNode(GraphNode):
                 self._output.clear()
         self._has_begun = True
         return True
+
+    def _read_places(self) -> None:
+        try:
+            self._late_places = self._places()
+        except BdgsError as error:
+            self._health.error(error)
+
+    def _learn_places(self) -> None:
+        late, self._late_places = self._late_places, []
+        if late:
+            self._tracker.learn(late, [np.zeros((6, 6))] * len(late))
 
     def _places(self) -> list[Keyframe]:
         """Read the keyframes of the map that mapping has: the camera may be anywhere in it."""
@@ -168,6 +187,7 @@ class TrackingNode(GraphNode):
         move = self._tracker.take_move()
         if move is not None:
             self._output.publish_move(raw.stamp_ns, move)
+        self._learn_places()
         started = time.perf_counter()
         result = self._tracker.process(frame, labels, self._is_hurried())
         self._explore(frame, labels, result)
