@@ -6,7 +6,7 @@ import logging
 import sys
 import time
 from collections import abc
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,8 +16,9 @@ from bdgs_ros.ahead import DetectedAhead
 from bdgs_ros.core.config import BdgsConfig
 from bdgs_ros.core.errors import DatasetError
 from bdgs_ros.core.types import Pose, RgbdFrame
+from bdgs_ros.data.bag_recording import CameraTopics
 from bdgs_ros.data.loop import LoopedSequence, LoopedTruth
-from bdgs_ros.data.sequence import Sequence
+from bdgs_ros.data.sequence import ReadableFrames, Sequence
 from bdgs_ros.data.synth.truth import SynthTruth
 from bdgs_ros.eval.metric import Metric
 from bdgs_ros.eval.pictures import write_posterior
@@ -39,6 +40,8 @@ class Job:
     config: BdgsConfig = field(default_factory=BdgsConfig)
     camera_file: Path | None = None
     allow_truncated: bool = False
+    topics: CameraTopics = field(default_factory=CameraTopics)
+    """Of a bag; by default found by their names."""
     start: int = 0
     frames: int | None = None
     loop_frames: int | None = None
@@ -103,7 +106,7 @@ def run_job(
         slam.start_from(job.map_file, sequence.camera, job.start_pose, localise=job.localise)
     start = time.perf_counter()
     watching = [watch for watch in (labels, posterior) if watch is not None]
-    frames = _with_progress(sequence, chosen, job.progress)
+    frames = ReadableFrames(sequence, _with_progress(sequence.name, chosen, job.progress))
     result = _run(frames, slam, [*watching, *observers], Recorder(job.samples))
     wall_s = time.perf_counter() - start
     metrics = write_results(
@@ -113,9 +116,13 @@ def run_job(
         name=sequence.name,
         ground_truth=sequence.ground_truth,
         truth=truth,
-        more=[*([] if labels is None else labels.score.metrics()), *more()],
+        more=[
+            Metric('frames_skipped', len(frames.skipped) + getattr(sequence, 'repeated', 0)),
+            *([] if labels is None else labels.score.metrics()),
+            *more(),
+        ],
         config=job.config,
-        notes=[*notes, *_apart(slam)],
+        notes=[*notes, *_left_out(sequence, frames), *_apart(slam)],
         extra={'frames': [chosen.start, chosen.stop], 'wall_s': wall_s},
         keep_keyframes=job.keyframes,
         with_pictures=job.pictures,
@@ -136,6 +143,16 @@ def _run(
             return run_sequence(labelled, slam, observers, recorder)
     finally:
         slam.detection = stage
+
+
+def _left_out(sequence: Sequence, frames: ReadableFrames) -> list[str]:
+    """Say which frames were not run."""
+    notes, repeated = [], getattr(sequence, 'repeated', 0)
+    if repeated:
+        notes.append(f'{repeated} frames have the stamp of the one before: left out')
+    if frames.skipped:
+        notes.append(f'{len(frames.skipped)} frames left out, the first: {frames.skipped[0]}')
+    return notes
 
 
 def _apart(slam: Any) -> list[str]:
@@ -180,6 +197,7 @@ def _paired(job: Job) -> Sequence:
         job.camera_file,
         allow_truncated=job.allow_truncated,
         depth_offset_s=job.config.camera.depth_offset_s,
+        topics=job.topics,
     )
 
 
@@ -198,16 +216,10 @@ def open_truth(recording: Path) -> SynthTruth | None:
     return SynthTruth(recording) if SynthTruth.available(recording) else None
 
 
-def _with_progress(sequence: Sequence, chosen: range, show: bool) -> Iterator[RgbdFrame]:
+def _with_progress(name: str, chosen: range, show: bool) -> Iterable[int]:
     from tqdm import tqdm
 
-    bar = tqdm(
-        chosen, desc=sequence.name, unit='frame', file=sys.stderr, disable=not show, leave=False
+    bar: Iterable[int] = tqdm(
+        chosen, desc=name, unit='frame', file=sys.stderr, disable=not show, leave=False
     )
-    if len(chosen) == len(sequence):
-        frames = iter(sequence)  # one pass, which bags read much faster than frame by frame
-        for _ in bar:
-            yield next(frames)
-    else:
-        for index in bar:
-            yield sequence[index]
+    return bar

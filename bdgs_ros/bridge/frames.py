@@ -187,6 +187,16 @@ class FrameSource:
                 logger.info(change.text)
         silent = self._watchdog.silent()
         self._health.mark('silent', f'silent: {", ".join(silent)}' if silent else '')
+        counts = self._sync.counts
+        stand = counts.pairs <= 1 and counts.duplicates > _HELD_FOR_INFO
+        self._health.set_problem(
+            'stamps',
+            f"{counts.duplicates} images on '{self._names[topics.COLOR]}' and "
+            f"'{self._names[topics.DEPTH]}' have the stamp of the one before and are left out: "
+            'stamps must advance; have the driver fill header.stamp'
+            if stand
+            else '',
+        )
         apart = (
             not silent
             and self._sync.counts.pairs == 0

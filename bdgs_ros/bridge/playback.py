@@ -10,7 +10,7 @@ from bdgs_ros.bridge.synchroniser import Patience, SyncCounts, Synchroniser
 from bdgs_ros.core.errors import DatasetError
 from bdgs_ros.data.bag import BagReader, header_stamp_ns
 from bdgs_ros.data.bag_cursor import RawMessage
-from bdgs_ros.data.bag_recording import INFO_TOPIC, TopicLayout, recognise
+from bdgs_ros.data.bag_recording import CameraTopics, TopicLayout, find_layout
 from bdgs_ros.data.trajectory_io import seconds_to_ns
 
 _NOT_REPLAYED = ('/clock', '/rosout', '/parameter_events', '/diagnostics')
@@ -53,7 +53,8 @@ class Playback:
             )
         self._reader = reader
         self._config = config
-        self.layout = _find_layout(reader, config)
+        names = CameraTopics(config.color_topic, config.depth_topic, config.info_topic)
+        self.layout = find_layout(reader, names)
         self.counts = SyncCounts()
         self.topics = {
             name: info.msgtype
@@ -103,16 +104,3 @@ def flush(pairing: Synchroniser[RawMessage, RawMessage]) -> list[Pair]:
 
 def _pair(color: RawMessage, depth: RawMessage) -> Pair:
     return Pair(header_stamp_ns(color.data), color, depth)
-
-
-def _find_layout(reader: BagReader, config: ReplayConfig) -> TopicLayout:
-    if not config.color_topic and not config.depth_topic:
-        return recognise(reader)
-    info = config.info_topic or INFO_TOPIC
-    missing = [t for t in (config.color_topic, config.depth_topic) if t not in reader.topics]
-    if missing:
-        raise DatasetError(
-            f"'{reader.path}' has no topic {', '.join(map(repr, missing))}; give both color_topic "
-            f'and depth_topic; it has {", ".join(sorted(reader.topics))}'
-        )
-    return TopicLayout('given', config.color_topic, config.depth_topic, info)

@@ -1,7 +1,8 @@
-"""Publish serialised messages untouched."""
+"""Publish serialised messages untouched; packed images of the camera unpacked."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
@@ -11,8 +12,17 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 
 from bdgs_ros.bridge import topics
+from bdgs_ros.core.errors import DatasetError
 from bdgs_ros.data.bag_cursor import RawMessage
 from bdgs_ros.data.bag_recording import TopicLayout
+from bdgs_ros.data.messages import (
+    COMPRESSED_IMAGE,
+    IMAGE,
+    unpacked_color,
+    unpacked_depth,
+)
+
+Unpack = Callable[[bytes, str], bytes]
 
 
 def message_class(msgtype: str) -> Any:
@@ -44,15 +54,24 @@ class RawPublishers:
     def __init__(
         self, node: Node, bag_topics: dict[str, str], layout: TopicLayout, qos: QoSProfile
     ) -> None:
+        self._logger = node.get_logger()
         renamed = {
             layout.color: topics.COLOR,
             layout.depth: topics.DEPTH,
             layout.info: topics.COLOR_INFO,
         }
         self._publishers: dict[str, Publisher] = {}
+        self._unpack: dict[str, Unpack] = {
+            topic: unpack
+            for topic, unpack in (
+                (layout.color, unpacked_color),
+                (layout.depth, unpacked_depth),
+            )
+            if bag_topics.get(topic) == COMPRESSED_IMAGE
+        }
         for topic, msgtype in bag_topics.items():
             try:
-                kind = message_class(msgtype)
+                kind = message_class(IMAGE if topic in self._unpack else msgtype)
             except ImportError as error:
                 node.get_logger().warning(f"'{topic}' is not replayed: {error}")
                 continue
@@ -67,10 +86,17 @@ class RawPublishers:
         ]
 
     def publish(self, message: RawMessage) -> None:
-        """Send the bytes as they are."""
-        publisher = self._publishers.get(message.topic)
-        if publisher is not None:
-            publisher.publish(bytes(message.data))
+        """Send the bytes as they are, or the image that is packed in them, if it can be read."""
+        publisher, unpack = (
+            known.get(message.topic) for known in (self._publishers, self._unpack)
+        )
+        if publisher is None:
+            return
+        data = bytes(message.data)
+        try:
+            publisher.publish(data if unpack is None else unpack(data, message.topic))
+        except DatasetError as error:
+            self._logger.warning(f'an image is not replayed: {error}')
 
     def subscribers(self) -> int:
         """Return how many subscribers every camera topic has at least."""

@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 from types import FrameType
 
+from bdgs_ros.cli.topics import add_topic_arguments, camera_topics
 from bdgs_ros.data.convert import (
     COMPRESSIONS,
     DEPTH_ENCODINGS,
@@ -46,6 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         '(default: %(default)s)')  # fmt: skip
     parser.add_argument('--allow-truncated', action='store_true',
                         help='use what is readable of a bag that was cut off')  # fmt: skip
+    add_topic_arguments(parser)
     parser.add_argument('--force', action='store_true', help='replace an existing bag')
     parser.add_argument('--json', action='store_true', help='report as json')
 
@@ -65,7 +67,9 @@ def run(args: argparse.Namespace) -> int:
     before = signal.signal(signal.SIGTERM, _interrupt)
     began = time.perf_counter()
     try:
-        recording = open_recording(args.source, args.camera, args.allow_truncated)
+        recording = open_recording(
+            args.source, args.camera, args.allow_truncated, camera_topics(args)
+        )
         report = convert(recording, args.bag, options)
     finally:
         signal.signal(signal.SIGTERM, before)
@@ -85,6 +89,7 @@ def _as_json(report: ConvertReport, seconds: float) -> str:
         'topics': report.counts,
         'pairs': report.pairs,
         'unpaired_color': list(report.unpaired_color),
+        'damaged': list(report.damaged),
         'duration_s': report.duration_s,
         'size_bytes': report.size_bytes,
         'seconds': seconds,
@@ -99,5 +104,6 @@ def _as_text(report: ConvertReport, seconds: float) -> str:
         *(f'  {topic:<28} {count:>6} messages' for topic, count in report.counts.items()),
         f'  {report.pairs} RGB-D pairs, {len(report.unpaired_color)} colour images without depth',
         *(f'    without depth: {name}' for name in report.unpaired_color),
+        *(f'    left out: {text}' for text in report.damaged),
     ]
     return '\n'.join(lines) + '\n'

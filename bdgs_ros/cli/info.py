@@ -8,6 +8,7 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
+from bdgs_ros.cli.topics import add_topic_arguments, camera_topics
 from bdgs_ros.data.inspect import Stream, Summary, summarise
 
 NAME = 'info'
@@ -20,12 +21,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--camera', type=Path, metavar='FILE', help='camera.yaml to use')
     parser.add_argument('--allow-truncated', action='store_true',
                         help='look at what is readable of a bag that was cut off')  # fmt: skip
+    add_topic_arguments(parser)
     parser.add_argument('--json', action='store_true', help='report as json')
 
 
 def run(args: argparse.Namespace) -> int:
     """Inspect and report."""
-    summary = summarise(args.recording, args.camera, args.allow_truncated)
+    summary = summarise(args.recording, args.camera, args.allow_truncated, camera_topics(args))
     if args.json:
         sys.stdout.write(json.dumps(asdict(summary), indent=2) + '\n')
     else:

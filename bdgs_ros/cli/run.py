@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from bdgs_ros.cli.config import add_config_arguments, load_config, with_weights
+from bdgs_ros.cli.topics import add_topic_arguments, camera_topics
 from bdgs_ros.core.errors import ConfigError
 from bdgs_ros.core.types import Pose
 from bdgs_ros.data.trajectory_io import POSE_COLUMNS, parse_pose
@@ -43,6 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--allow-truncated', action='store_true', help='use what is readable of a cut-off bag'
     )
+    add_topic_arguments(parser)
     parser.add_argument('--no-pictures', action='store_true', help='leave the pictures out')
     parser.add_argument(
         '--no-keyframes', action='store_true', help='leave the images for `bdgs refine` out'
@@ -72,6 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
         config=with_weights(load_config(arguments), arguments.weights),
         camera_file=arguments.camera,
         allow_truncated=arguments.allow_truncated,
+        topics=camera_topics(arguments),
         start=arguments.start,
         frames=arguments.frames,
         loop_frames=arguments.loop_frames,

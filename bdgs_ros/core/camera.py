@@ -4,12 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from bdgs_ros.core.errors import DatasetError
+
+PLUMB_BOB, RATIONAL, FISHEYE = 'plumb_bob', 'rational_polynomial', 'equidistant'
+DISTORTIONS = {PLUMB_BOB: (4, 5), RATIONAL: (8, 12, 14), FISHEYE: (4,)}
+"""
+How many coefficients each model may have: k1 k2 p1 p2 k3, then k4 k5 k6 and those of a thin prism
+and a tilted sensor, as OpenCV orders them; k1 to k4 of `cv2.fisheye`.
+"""
 
 
 @dataclass(frozen=True)
@@ -18,7 +26,8 @@ class PinholeCamera:
     Intrinsics at one resolution.
 
     The centre of the top left pixel has image coordinates (0, 0), as in OpenCV and ROS.
-    `distortion` is `plumb_bob`: k1 k2 p1 p2 k3; all zero for a rectified image.
+    `distortion` is what the model of that name has in ROS, see `DISTORTIONS`; all zero for a
+    rectified image.
     """
 
     width: int
@@ -27,7 +36,8 @@ class PinholeCamera:
     fy: float
     cx: float
     cy: float
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion_model: str = PLUMB_BOB
 
     @property
     def matrix(self) -> NDArray[np.float64]:
@@ -46,7 +56,7 @@ class PinholeCamera:
 
     def rectified(self) -> PinholeCamera:
         """Return the same camera without distortion."""
-        return replace(self, distortion=(0.0,) * 5)
+        return replace(self, distortion=(0.0,) * 5, distortion_model=PLUMB_BOB)
 
     def scaled(self, factor: float) -> PinholeCamera:
         """Return the camera of the image resized by `factor`; pixel areas, not centres, scale."""
@@ -110,6 +120,14 @@ def _rays(camera: PinholeCamera) -> NDArray[np.float32]:
     return rays
 
 
+def _look_up(camera: PinholeCamera, kind: int) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return where in the distorted image each pixel of the rectified one is, as OpenCV does."""
+    size, matrix = (camera.width, camera.height), camera.matrix
+    is_fisheye = camera.distortion_model == FISHEYE
+    make = cv2.fisheye.initUndistortRectifyMap if is_fisheye else cv2.initUndistortRectifyMap
+    return make(matrix, np.array(camera.distortion), np.eye(3), matrix, size, kind)
+
+
 class Rectifier:
     """
     Remove lens distortion from colour (bilinear) and depth (nearest, so no depths are mixed).
@@ -124,15 +142,8 @@ class Rectifier:
         self._maps = None if camera.is_rectified else self._build_maps()
 
     def _build_maps(self) -> tuple[NDArray[np.int16], NDArray[np.uint16], NDArray[np.int16]]:
-        distortion = np.array(self._source.distortion)
-        size = (self._source.width, self._source.height)
-        matrix = self._source.matrix
-        fixed, fraction = cv2.initUndistortRectifyMap(
-            matrix, distortion, None, matrix, size, cv2.CV_16SC2
-        )
-        nearest, _ = cv2.initUndistortRectifyMap(
-            matrix, distortion, None, matrix, size, cv2.CV_32FC2
-        )
+        fixed, fraction = _look_up(self._source, cv2.CV_16SC2)
+        nearest = np.stack(_look_up(self._source, cv2.CV_32FC1), axis=-1)
         return (
             np.asarray(fixed, dtype=np.int16),
             np.asarray(fraction, dtype=np.uint16),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +16,12 @@ from bdgs_ros.core.types import ColorImage, DepthImage, StampedPose, Trajectory
 from bdgs_ros.data.associate import MAX_DIFFERENCE_S
 from bdgs_ros.data.bag import BagReader, MessageRef, open_bag
 from bdgs_ros.data.messages import (
+    COMPRESSED_IMAGE,
     MM_PER_M,
     camera_from_message,
+    color_from_compressed,
     color_from_message,
+    depth_from_compressed,
     depth_from_message,
     pose_from_message,
     stamp_ns,
@@ -32,6 +35,9 @@ COLOR_TOPIC = '/camera/color/image_raw'
 DEPTH_TOPIC = '/camera/depth/image_raw'
 INFO_TOPIC = '/camera/color/camera_info'
 GROUND_TRUTH_TOPIC = '/ground_truth/pose'
+
+_COMPRESSED = ('/compressed',)
+_COMPRESSED_DEPTH = ('/compressedDepth', '/compressed')
 
 GroundTruthReader = Callable[[BagReader, str], Trajectory | None]
 
@@ -108,7 +114,7 @@ class BagRecording:
         Use this camera instead of the one in the bag.
     depth_scale : float, optional
         Units of 16-bit depth in a metre; by default millimetres.
-    layout : TopicLayout, optional
+    topics : CameraTopics, optional
         The names of the topics; recognised by default.
 
     Raises
@@ -123,14 +129,14 @@ class BagRecording:
         reader: BagReader,
         camera: PinholeCamera | None = None,
         depth_scale: float | None = None,
-        layout: TopicLayout | None = None,
+        topics: CameraTopics | None = None,
     ) -> None:
         self.reader = reader
         self._depth_scale = depth_scale or MM_PER_M
         self.name = (
             reader.path.resolve().stem if reader.path.suffix else reader.path.resolve().name
         )
-        self.layout = layout or recognise(reader)
+        self.layout = find_layout(reader, topics)
         self.camera = camera or self._find_camera()
         index = reader.index([self.layout.color, self.layout.depth])
         self._color, self._depth = index[self.layout.color], index[self.layout.depth]
@@ -157,12 +163,37 @@ class BagRecording:
         if published is not None:
             return published.camera
         if self.layout.info in self.reader.topics:
-            for _, message in self.reader.messages([self.layout.info]):
-                return camera_from_message(message, self.layout.info)
+            return self._first_usable_camera()
         raise DatasetError(
             f"'{self.reader.path}' has no message on '{self.layout.info}'; "
             'give the camera with --camera'
         )
+
+    def _first_usable_camera(self) -> PinholeCamera:
+        """Return the first camera that is calibrated and, if any is, of the size of the images."""
+        shape = self._shape_of_color()
+        found: PinholeCamera | None = None
+        first_error: DatasetError | None = None
+        for _, message in self.reader.messages([self.layout.info]):
+            try:
+                camera = camera_from_message(message, self.layout.info)
+            except DatasetError as error:  # drivers send some before they know
+                first_error = first_error or error
+                continue
+            if shape in (None, camera.shape):
+                return camera
+            found = found or camera
+        if found is None:
+            raise first_error or DatasetError(
+                f"'{self.reader.path}' has no message on '{self.layout.info}'; "
+                'give the camera with --camera'
+            )
+        return found
+
+    def _shape_of_color(self) -> tuple[int, int] | None:
+        for _, message in self.reader.messages([self.layout.color]):
+            return self._decode_color(message).shape[:2]
+        return None
 
     def color_name(self, index: int) -> str:
         """Return topic and stamp of a colour image."""
@@ -183,19 +214,23 @@ class BagRecording:
 
     def _to_color(self, data: bytes) -> ColorImage:
         topic = self.layout.color
-        image = color_from_message(
-            self.reader.deserialize(data, self.reader.topics[topic].msgtype), topic
+        image = self._decode_color(
+            self.reader.deserialize(data, self.reader.topics[topic].msgtype)
         )
         self._check_size(topic, image.shape[:2])
         return image
 
+    def _decode_color(self, message: Any) -> ColorImage:
+        packed = self.reader.topics[self.layout.color].msgtype == COMPRESSED_IMAGE
+        return (color_from_compressed if packed else color_from_message)(
+            message, self.layout.color
+        )
+
     def _to_depth(self, data: bytes) -> DepthImage:
         topic = self.layout.depth
-        image = depth_from_message(
-            self.reader.deserialize(data, self.reader.topics[topic].msgtype),
-            topic,
-            self._depth_scale,
-        )
+        kind = self.reader.topics[topic].msgtype
+        decode = depth_from_compressed if kind == COMPRESSED_IMAGE else depth_from_message
+        image = decode(self.reader.deserialize(data, kind), topic, self._depth_scale)
         self._check_size(topic, image.shape)
         return image
 
@@ -211,17 +246,63 @@ def _stamps(refs: list[MessageRef]) -> NDArray[np.int64]:
     return np.array([ref.stamp_ns for ref in refs], dtype=np.int64)
 
 
+@dataclass(frozen=True)
+class CameraTopics:
+    """What the topics of a camera are called in a bag; empty: found by their names."""
+
+    color: str = ''
+    depth: str = ''
+    info: str = ''
+
+
+def find_layout(reader: BagReader, given: CameraTopics | None = None) -> TopicLayout:
+    """
+    Find the camera's topics.
+
+    Parameters
+    ----------
+    reader : BagReader
+        The open bag.
+    given : CameraTopics, optional
+        Their names, as far as somebody has said them.
+
+    Raises
+    ------
+    DatasetError
+        If there are no colour and depth topics of these names, or of any that is known.
+
+    """
+    if given is None or not (given.color or given.depth):
+        found = recognise(reader)
+        return replace(found, info=given.info) if given is not None and given.info else found
+    missing = [repr(t) for t in (given.color, given.depth) if t not in reader.topics]
+    if missing:
+        raise DatasetError(
+            f"'{reader.path}' has no topic {', '.join(missing)}; give both the colour and the "
+            f'depth topic; it has {", ".join(sorted(reader.topics))}'
+        )
+    return TopicLayout('given', given.color, given.depth, given.info or INFO_TOPIC)
+
+
 def recognise(reader: BagReader) -> TopicLayout:
     """Find the layout whose colour and depth topics are in the bag; `DatasetError` if none."""
     for layout in LAYOUTS:
-        if layout.color in reader.topics and layout.depth in reader.topics:
-            return layout
+        color = _present(reader, layout.color, _COMPRESSED)
+        depth = _present(reader, layout.depth, _COMPRESSED_DEPTH)
+        if color and depth:
+            return replace(layout, color=color, depth=depth)
     wanted = '\n'.join(f'  {x.name}: {x.color} and {x.depth}' for x in LAYOUTS)
     found = ', '.join(f'{t} ({i.msgtype})' for t, i in sorted(reader.topics.items()))
     raise DatasetError(
         f"'{reader.path}' has no known pair of colour and depth topics. Looked for\n{wanted}\n"
-        f'found {found or "no topics"}'
+        f'found {found or "no topics"}; name them with --color-topic and --depth-topic (bdgs) or '
+        'color_topic and depth_topic (slam_node)'
     )
+
+
+def _present(reader: BagReader, topic: str, suffixes: tuple[str, ...]) -> str:
+    """Return the name under which a topic is in a bag, raw or as image_transport packs it."""
+    return next((topic + s for s in ('', *suffixes) if topic + s in reader.topics), '')
 
 
 class BagSequence(RecordedSequence):

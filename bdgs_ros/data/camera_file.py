@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import yaml
 
-from bdgs_ros.core.camera import PinholeCamera
+from bdgs_ros.core.camera import DISTORTIONS, PLUMB_BOB, PinholeCamera
 from bdgs_ros.core.errors import DatasetError
 
 CAMERA_FILE = 'camera.yaml'
 _REQUIRED = ('width', 'height', 'fx', 'fy', 'cx', 'cy')
-_OPTIONAL = ('distortion', 'depth_scale')
+_OPTIONAL = ('distortion', 'distortion_model', 'depth_scale')
 _EXAMPLE = (
     'camera: {width: 640, height: 480, fx: 525.0, fy: 525.0, cx: 319.5, cy: 239.5, '
     'distortion: [0, 0, 0, 0, 0], depth_scale: 5000}'
@@ -62,10 +62,11 @@ def _from_section(path: Path, section: Mapping[str, Any]) -> RecordedCamera:
             f"'{path}': missing keys {missing}, unknown keys {unknown}; expected\n  {_EXAMPLE}"
         )
     try:
-        k1, k2, p1, p2, k3 = (float(k) for k in section.get('distortion', (0, 0, 0, 0, 0)))
+        distortion = tuple(float(k) for k in section.get('distortion', (0, 0, 0, 0, 0)))
+        model = str(section.get('distortion_model', PLUMB_BOB))
         fx, fy, cx, cy = (float(section[key]) for key in ('fx', 'fy', 'cx', 'cy'))
         width, height = int(section['width']), int(section['height'])
-        camera = PinholeCamera(width, height, fx, fy, cx, cy, (k1, k2, p1, p2, k3))
+        camera = PinholeCamera(width, height, fx, fy, cx, cy, distortion, model)
         scale = section.get('depth_scale')
         recorded = RecordedCamera(camera, None if scale is None else float(scale))
     except (TypeError, ValueError) as error:
@@ -76,6 +77,13 @@ def _from_section(path: Path, section: Mapping[str, Any]) -> RecordedCamera:
 
 def _check(path: Path, recorded: RecordedCamera) -> None:
     camera = recorded.camera
+    allowed = DISTORTIONS.get(camera.distortion_model, ())
+    if len(camera.distortion) not in allowed:
+        models = ', '.join(f'{name} with {counts}' for name, counts in DISTORTIONS.items())
+        raise DatasetError(
+            f"'{path}': distortion_model '{camera.distortion_model}' with "
+            f'{len(camera.distortion)} coefficients; expected one of {models}'
+        )
     scale = 1.0 if recorded.depth_scale is None else recorded.depth_scale
     positive = (camera.width, camera.height, camera.fx, camera.fy, scale)
     finite = (*positive, camera.cx, camera.cy, *camera.distortion)

@@ -112,6 +112,8 @@ class ConvertReport:
     unpaired_color: tuple[str, ...]
     duration_s: float
     size_bytes: int
+    damaged: tuple[str, ...] = ()
+    """What was wrong with images that were left out."""
 
 
 class _Event(NamedTuple):
@@ -159,8 +161,8 @@ def convert(
     events = _events(source, options)
     _check_space(bag, source, events, options)
     with _aside(bag, options.force) as folder:
-        _write(folder, source, events, options)
-    return _report(bag, source, events, options)
+        damaged = _write(folder, source, events, options)
+    return _report(bag, source, events, options, damaged)
 
 
 def _check_target(bag: Path, force: bool) -> None:
@@ -243,7 +245,8 @@ def _aside(bag: Path, force: bool) -> Iterator[Path]:
 
 def _write(
     folder: Path, recording: Recording, events: list[_Event], options: ConvertOptions
-) -> None:
+) -> list[str]:
+    """Write what can be read; return what was wrong with the rest."""
     # version 9 is what Jazzy writes
     writer = Writer(folder, version=9, storage_plugin=STORAGES[options.storage])
     if options.compression == 'zstd':
@@ -261,9 +264,19 @@ def _write(
         bar = tqdm(
             events, unit='msg', desc=folder.name, disable=None if options.progress else True
         )
+        damaged: list[str] = []
+        has_color = False
         for event in bar:
-            data = _serialize(recording, event, options.depth_encoding)
+            try:
+                data = _serialize(recording, event, options.depth_encoding)
+            except DatasetError as error:
+                damaged.append(str(error))
+                continue
+            has_color = has_color or _ORDER[event.order] == COLOR_TOPIC
             writer.write(by_topic[_ORDER[event.order]], event.stamp_ns, data)
+    if damaged and not has_color:
+        raise DatasetError(damaged[0])
+    return damaged
 
 
 def _serialize(recording: Recording, event: _Event, depth_encoding: str) -> bytes:
@@ -291,7 +304,11 @@ def encode_depth(depth_m: DepthImage, encoding: str) -> np.ndarray[Any, Any]:
 
 
 def _report(
-    bag: Path, recording: Recording, events: list[_Event], options: ConvertOptions
+    bag: Path,
+    recording: Recording,
+    events: list[_Event],
+    options: ConvertOptions,
+    damaged: list[str],
 ) -> ConvertReport:
     counts = np.bincount([event.order for event in events], minlength=len(_ORDER))
     color = [event.item for event in events if _ORDER[event.order] == COLOR_TOPIC]
@@ -304,5 +321,6 @@ def _report(
         pairs=sum(index in paired for index in color),
         unpaired_color=tuple(recording.color_name(i) for i in color if i not in paired),
         duration_s=(max(stamps) - min(stamps)) / NS_PER_S,
+        damaged=tuple(damaged),
         size_bytes=sum(file.stat().st_size for file in bag.rglob('*') if file.is_file()),
     )

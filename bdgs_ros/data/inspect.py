@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.errors import DatasetError
 from bdgs_ros.data.bag import BagReader, is_bag, open_bag
+from bdgs_ros.data.bag_recording import CameraTopics
 from bdgs_ros.data.layouts import open_recording
 from bdgs_ros.data.sequence import RecordedSequence, Recording
 from bdgs_ros.data.trajectory_io import NS_PER_S
@@ -67,23 +68,32 @@ class Summary:
 
 
 def summarise(
-    path: Path | str, camera_file: Path | str | None = None, allow_truncated: bool = False
+    path: Path | str,
+    camera_file: Path | str | None = None,
+    allow_truncated: bool = False,
+    topics: CameraTopics | None = None,
 ) -> Summary:
     """Look into a recording; `DatasetError` if it cannot be opened at all."""
     path = Path(path)
     if path.exists() and is_bag(path) and not (path / 'rgb.txt').is_file():
-        return _summarise_bag(path, camera_file, allow_truncated)
+        return _summarise_bag(path, camera_file, allow_truncated, topics)
     recording = open_recording(path, camera_file)
     stamps = recording.color_stamps_ns
     duration_s = float(stamps[-1] - stamps[0]) / NS_PER_S
     return _with_images(Summary(str(path), 'folder', duration_s, False, ()), recording)
 
 
-def _summarise_bag(path: Path, camera_file: Path | str | None, allow_truncated: bool) -> Summary:
+def _summarise_bag(
+    path: Path,
+    camera_file: Path | str | None,
+    allow_truncated: bool,
+    topics: CameraTopics | None,
+) -> Summary:
     with open_bag(path, allow_truncated) as reader:
         summary = _topics(reader)
     try:
-        return _with_images(summary, open_recording(path, camera_file, allow_truncated))
+        recording = open_recording(path, camera_file, allow_truncated, topics)
+        return _with_images(summary, recording)
     except DatasetError as error:
         return Summary(**{**vars(summary), 'problem': str(error)})
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from bdgs_ros.core.errors import DatasetError
 from bdgs_ros.data.associate import MAX_DIFFERENCE_S
 from bdgs_ros.data.bag import is_bag, open_bag
-from bdgs_ros.data.bag_recording import BagRecording
+from bdgs_ros.data.bag_recording import BagRecording, CameraTopics
 from bdgs_ros.data.bonn import CAMERA as BONN_CAMERA
 from bdgs_ros.data.bonn import open_bonn
 from bdgs_ros.data.camera_file import CAMERA_FILE, RecordedCamera, read_camera_file
@@ -24,7 +24,10 @@ _LOOKED_FOR = (
 
 
 def open_recording(
-    path: Path | str, camera_file: Path | str | None = None, allow_truncated: bool = False
+    path: Path | str,
+    camera_file: Path | str | None = None,
+    allow_truncated: bool = False,
+    topics: CameraTopics | None = None,
 ) -> Recording:
     """
     Open a recording of any known layout, images as recorded.
@@ -37,6 +40,8 @@ def open_recording(
         A `camera.yaml` that overrules what is known about the camera.
     allow_truncated : bool
         Use what is readable of a bag that was cut off.
+    topics : CameraTopics, optional
+        What the camera's topics are called in a bag.
 
     Raises
     ------
@@ -55,8 +60,8 @@ def open_recording(
     if is_bag(path):
         bag = open_bag(path, allow_truncated)
         if camera is None:
-            return BagRecording(bag)
-        return BagRecording(bag, camera.camera, camera.depth_scale)
+            return BagRecording(bag, topics=topics)
+        return BagRecording(bag, camera.camera, camera.depth_scale, topics)
     raise DatasetError(_unknown_layout(path))
 
 
@@ -66,13 +71,14 @@ def open_sequence(
     max_difference_s: float = MAX_DIFFERENCE_S,
     allow_truncated: bool = False,
     depth_offset_s: float = 0.0,
+    topics: CameraTopics | None = None,
 ) -> RecordedSequence:
     """
     Open a recording of any known layout as rectified RGB-D frames.
 
     See `open_recording` and `RecordedSequence`.
     """
-    recording = open_recording(path, camera_file, allow_truncated)
+    recording = open_recording(path, camera_file, allow_truncated, topics)
     return RecordedSequence(recording, max_difference_s, depth_offset_s)
 
 

@@ -6,6 +6,7 @@ The same file serves ROS 1 and ROS 2: rosbags names their fields alike, except i
 
 from __future__ import annotations
 
+import struct
 import sys
 from functools import cache
 from typing import Any
@@ -17,13 +18,14 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from bdgs_ros.core import se3
-from bdgs_ros.core.camera import PinholeCamera
+from bdgs_ros.core.camera import DISTORTIONS, FISHEYE, PLUMB_BOB, RATIONAL, PinholeCamera
 from bdgs_ros.core.errors import DatasetError
 from bdgs_ros.core.images import metres
 from bdgs_ros.core.types import ColorImage, DepthImage, Pose
 from bdgs_ros.data.trajectory_io import NS_PER_S
 
 IMAGE = 'sensor_msgs/msg/Image'
+COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
 CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
 POSE_STAMPED = 'geometry_msgs/msg/PoseStamped'
 
@@ -35,6 +37,14 @@ _TO_RGB = {
     'mono8': cv2.COLOR_GRAY2RGB,
 }
 _DEPTH_TYPES = {'16UC1': 'u2', 'mono16': 'u2', '32FC1': 'f4'}
+_MODELS = {
+    '': PLUMB_BOB,
+    'none': PLUMB_BOB,
+    'radtan': PLUMB_BOB,
+    'fisheye': FISHEYE,
+    'kannala_brandt4': FISHEYE,
+}
+_DEPTH_HEADER = struct.Struct('<iff')
 MM_PER_M = 1000.0
 
 
@@ -95,6 +105,72 @@ def depth_from_message(message: Any, topic: str, per_metre: float = MM_PER_M) ->
     return depth_m
 
 
+def color_from_compressed(message: Any, topic: str) -> ColorImage:
+    """
+    Decode a colour CompressedImage: JPEG, PNG or whatever else OpenCV reads.
+
+    Raises
+    ------
+    DatasetError
+        If it cannot be decoded.
+
+    """
+    image = _decoded(bytes(message.data), cv2.IMREAD_COLOR, message, topic)
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def depth_from_compressed(message: Any, topic: str, per_metre: float = MM_PER_M) -> DepthImage:
+    """
+    Decode a depth CompressedImage, as `compressed_depth_image_transport` or a PNG of 16 bits.
+
+    The former has a header of 12 bytes; what was float is `a / depth + b` there.
+
+    Raises
+    ------
+    DatasetError
+        If it cannot be decoded.
+
+    """
+    data = bytes(message.data)
+    if 'compressedDepth' not in message.format:
+        counts = _decoded(data, cv2.IMREAD_UNCHANGED, message, topic)
+    else:
+        counts = _decoded(data[_DEPTH_HEADER.size :], cv2.IMREAD_UNCHANGED, message, topic)
+        if message.format.startswith('32FC1'):
+            _, a, b = _DEPTH_HEADER.unpack_from(data)
+            nearness = (counts.astype(np.float32) - b) / a
+            return np.where((counts > 0) & (nearness > 0), 1 / np.maximum(nearness, 1e-6), 0)
+    if counts.dtype != np.uint16 or counts.ndim != 2:
+        raise DatasetError(
+            f"topic '{topic}': expected depth of 16 bits, received '{message.format}' of "
+            f'{counts.dtype} {counts.shape}'
+        )
+    return metres(counts, per_metre)
+
+
+def unpacked_color(data: bytes, topic: str) -> bytes:
+    """Return a CompressedImage in CDR as an Image in CDR; `DatasetError` if it is none."""
+    message: Any = jazzy().deserialize_cdr(data, COMPRESSED_IMAGE)
+    image = color_from_compressed(message, topic)
+    return serialize_image(stamp_ns(message), message.header.frame_id, image, 'rgb8')
+
+
+def unpacked_depth(data: bytes, topic: str) -> bytes:
+    """Return a CompressedImage of depth in CDR as an Image in metres."""
+    message: Any = jazzy().deserialize_cdr(data, COMPRESSED_IMAGE)
+    depth_m = depth_from_compressed(message, topic)
+    return serialize_image(stamp_ns(message), message.header.frame_id, depth_m, '32FC1')
+
+
+def _decoded(data: bytes, flags: int, message: Any, topic: str) -> NDArray[Any]:
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    if image is None:
+        raise DatasetError(
+            f"topic '{topic}': {len(data)} bytes of '{message.format}' cannot be decoded"
+        )
+    return np.asarray(image)
+
+
 def _unknown_encoding(message: Any, topic: str, what: str, known: dict[str, Any]) -> DatasetError:
     return DatasetError(
         f"topic '{topic}': expected {what} encoded as {', '.join(known)}, "
@@ -120,31 +196,52 @@ def camera_from_message(message: Any, topic: str) -> PinholeCamera:
     """
     Read a CameraInfo of ROS 1 or 2.
 
+    Where K is empty and images are without distortion, the projection P serves as well: some
+    drivers fill nothing else.
+
     Raises
     ------
     DatasetError
-        If it is not calibrated, or its distortion is not `plumb_bob`.
+        If it is not calibrated, or its distortion is of a model that OpenCV does not know.
 
     """
     matrix = [float(value) for value in _field(message, 'k')]
-    coefficients = [float(value) for value in _field(message, 'd')]
-    if matrix[0] <= 0 or matrix[4] <= 0 or not message.width or not message.height:
+    model, coefficients = _distortion(message, topic)
+    if not any(matrix) and not any(coefficients):
+        matrix = [float(value) for i, value in enumerate(_field(message, 'p')) if i % 4 < 3]
+    finite = np.isfinite([*matrix, *coefficients]).all()
+    if not (finite and matrix[0] > 0 and matrix[4] > 0 and message.width and message.height):
         raise DatasetError(
             f"topic '{topic}': camera_info is not calibrated "
-            f'({message.width}x{message.height}, K = {matrix}); give the camera with --camera'
+            f'({message.width}x{message.height}, K = {matrix}, D = {list(coefficients)}); '
+            'give the camera with --camera'
         )
-    plumb_bob = message.distortion_model in ('plumb_bob', '') and len(coefficients) <= 5
-    if any(coefficients) and not plumb_bob:
-        raise DatasetError(
-            f"topic '{topic}': expected distortion model 'plumb_bob' with 5 coefficients, "
-            f"received '{message.distortion_model}' with {len(coefficients)}; "
-            'rectify the images first'
-        )
-    k1, k2, p1, p2, k3 = (coefficients + [0.0] * 5)[:5]
     return PinholeCamera(
         int(message.width), int(message.height), matrix[0], matrix[4], matrix[2], matrix[5],
-        distortion=(k1, k2, p1, p2, k3),
+        coefficients, model,
     )  # fmt: skip
+
+
+def _distortion(message: Any, topic: str) -> tuple[str, tuple[float, ...]]:
+    """Return model and coefficients, by the name and by how many there are."""
+    given = [float(value) for value in _field(message, 'd')]
+    model = _MODELS.get(message.distortion_model, message.distortion_model)
+    if not any(given):
+        return PLUMB_BOB, (0.0,) * 5
+    if model in (PLUMB_BOB, RATIONAL):  # some write plumb_bob and eight numbers, or the reverse
+        while len(given) > 5 and not given[-1]:
+            given.pop()
+        model = PLUMB_BOB if len(given) <= 5 else RATIONAL
+        most = max(DISTORTIONS[model])
+        wanted = next((n for n in DISTORTIONS[model] if n >= max(len(given), 5)), most)
+        given += [0.0] * (wanted - len(given))
+    if len(given) not in DISTORTIONS.get(model, ()):
+        raise DatasetError(
+            f"topic '{topic}': expected one of the distortion models {', '.join(DISTORTIONS)}, "
+            f"received '{message.distortion_model}' with {len(given)} coefficients; "
+            'rectify the images first'
+        )
+    return model, tuple(given)
 
 
 def _field(message: Any, name: str) -> Any:
@@ -201,7 +298,7 @@ def serialize_camera_info(at_ns: int, frame_id: str, camera: PinholeCamera) -> b
         _header(at_ns, frame_id),
         camera.height,
         camera.width,
-        'plumb_bob',
+        camera.distortion_model,
         np.array(camera.distortion),
         camera.matrix.reshape(-1),
         np.eye(3).reshape(-1),

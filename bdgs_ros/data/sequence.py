@@ -9,7 +9,7 @@ second from the first, the same way for every format.
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Protocol
 
@@ -20,10 +20,11 @@ from bdgs_ros.core.camera import PinholeCamera, Rectifier
 from bdgs_ros.core.errors import DatasetError
 from bdgs_ros.core.types import ColorImage, DepthImage, RgbdFrame, Trajectory
 from bdgs_ros.data.associate import MAX_DIFFERENCE_S, associate
-from bdgs_ros.data.trajectory_io import seconds_to_ns
+from bdgs_ros.data.trajectory_io import format_stamp_ns, seconds_to_ns
 
 _LOGGER = logging.getLogger(__name__)
 _NAMES_SHOWN = 5
+_FIRST_FEW = 5
 
 
 class Recording(Protocol):
@@ -156,7 +157,7 @@ class RecordedSequence:
     Raises
     ------
     DatasetError
-        If not a single pair can be made.
+        If not a single pair can be made, or all images have one and the same stamp.
 
     """
 
@@ -168,11 +169,15 @@ class RecordedSequence:
     ) -> None:
         self.recording = recording
         self._offset_ns = seconds_to_ns(depth_offset_s)
-        self._pairs = associate(
+        self._check_stamps()
+        pairs = associate(
             recording.color_stamps_ns,
             recording.depth_stamps_ns - self._offset_ns,
             seconds_to_ns(max_difference_s),
         )
+        self._pairs = self._without_repeated(pairs)
+        self.repeated = len(pairs) - len(self._pairs)
+        """How many frames were left out because they have the stamp of the one before."""
         self._rectifier = Rectifier(recording.camera)
         self.stamps_ns: NDArray[np.int64] = np.array(
             [recording.color_stamps_ns[i] for i, _ in self._pairs], dtype=np.int64
@@ -200,10 +205,32 @@ class RecordedSequence:
         """Indices of the colour and depth image of every frame."""
         return list(self._pairs)
 
+    def _check_stamps(self) -> None:
+        stamps_ns = self.recording.color_stamps_ns
+        if len(stamps_ns) > 1 and len(set(stamps_ns.tolist())) == 1:
+            raise DatasetError(
+                f"'{self.name}': all {len(stamps_ns)} colour images have the stamp "
+                f'{format_stamp_ns(int(stamps_ns[0]))} s; stamps must advance: have the driver '
+                'fill header.stamp, or write the list anew'
+            )
+
+    def _without_repeated(self, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
+        stamps_ns = [int(self.recording.color_stamps_ns[color]) for color, _ in pairs]
+        return [
+            pair
+            for pair, own, before in zip(pairs, stamps_ns, [None, *stamps_ns], strict=False)
+            if own != before
+        ]
+
     def _find_unpaired(self) -> tuple[str, ...]:
         paired = {i for i, _ in self._pairs}
-        count = len(self.recording.color_stamps_ns)
-        return tuple(self.recording.color_name(i) for i in range(count) if i not in paired)
+        known = set(self.stamps_ns.tolist())
+        stamps_ns = self.recording.color_stamps_ns.tolist()
+        return tuple(
+            self.recording.color_name(i)
+            for i, stamp_ns in enumerate(stamps_ns)
+            if i not in paired and stamp_ns not in known
+        )
 
     def _report(self, max_difference_s: float) -> None:
         colors, depths = len(self.recording.color_stamps_ns), len(self.recording.depth_stamps_ns)
@@ -213,6 +240,11 @@ class RecordedSequence:
                 f"'{self.name}' has {colors} colour and {depths} depth images but no two within "
                 f'{limit_ms:g} ms of each other; check the recording, or raise --max-difference'
             )
+        if self.repeated:
+            _LOGGER.warning(
+                "'%s': %d of %d frames have the stamp of the one before and are left out",
+                self.name, self.repeated, self.repeated + len(self._pairs),
+            )  # fmt: skip
         if self.unpaired_color:
             shown = ', '.join(self.unpaired_color[:_NAMES_SHOWN])
             more = ', ...' if len(self.unpaired_color) > _NAMES_SHOWN else ''
@@ -244,3 +276,55 @@ class RecordedSequence:
     def __iter__(self) -> Iterator[RgbdFrame]:
         """Read all frames in order."""
         return (self[index] for index in range(len(self)))
+
+
+class ReadableFrames:
+    """
+    Frames of a sequence, in order; those that are damaged are left out and counted.
+
+    Parameters
+    ----------
+    sequence : Sequence
+        Where they come from.
+    chosen : iterable of int
+        Which.
+
+    """
+
+    def __init__(self, sequence: Sequence, chosen: Iterable[int]) -> None:
+        self._sequence = sequence
+        self._chosen = chosen
+        self._has_read = False
+        self.skipped: list[str] = []
+        """What was wrong with each."""
+
+    def __iter__(self) -> Iterator[RgbdFrame]:
+        """
+        Read them.
+
+        Raises
+        ------
+        DatasetError
+            If none of the first few can be read: it is not an image that is wrong then.
+
+        """
+        error: DatasetError | None = None
+        for index in self._chosen:
+            frame, error = self._read(index)
+            if frame is not None:
+                yield frame
+            elif error is not None and not self._has_read and len(self.skipped) >= _FIRST_FEW:
+                raise error
+        if error is not None and not self._has_read:
+            raise error
+
+    def _read(self, index: int) -> tuple[RgbdFrame | None, DatasetError | None]:
+        try:
+            frame = self._sequence[index]
+        except DatasetError as error:
+            self.skipped.append(str(error))
+            if len(self.skipped) <= _NAMES_SHOWN:
+                _LOGGER.warning('frame %d is left out: %s', index, error)
+            return None, error
+        self._has_read = True
+        return frame, None

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from decimal import Decimal, InvalidOperation
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +14,11 @@ from bdgs_ros.core.errors import DatasetError
 from bdgs_ros.core.files import write_text
 from bdgs_ros.core.types import Pose, StampedPose, Trajectory
 
+_LOGGER = logging.getLogger(__name__)
+
 NS_PER_S = 1_000_000_000
+_LATEST_S = Decimal(10**11)  # the year 5138
+_UNITS = ('milliseconds', 'microseconds', 'nanoseconds')
 POSE_COLUMNS = 'x y z qx qy qz qw'
 
 
@@ -20,16 +26,36 @@ def parse_stamp_ns(text: str) -> int:
     """
     Turn a stamp in decimal seconds into integer nanoseconds, without rounding through float.
 
+    What is so large that it can only be milli-, micro- or nanoseconds is read as such, and said.
+
     Raises
     ------
     ValueError
-        If the text is not a finite decimal number.
+        If the text is not a finite decimal number, or no time that can be.
 
     """
     try:
-        return int((Decimal(text) * NS_PER_S).to_integral_value())
+        seconds = _in_seconds(Decimal(text))
+        return int((seconds * NS_PER_S).to_integral_value())
     except (InvalidOperation, OverflowError, ValueError) as error:
         raise ValueError(f'{text!r} is not a stamp in seconds') from error
+
+
+def _in_seconds(value: Decimal) -> Decimal:
+    """Return a time in seconds, of which unit it may be; ValueError if it is none that can be."""
+    if abs(value) < _LATEST_S:
+        return value
+    for unit in _UNITS:
+        value /= 1000
+        if abs(value) < _LATEST_S:
+            _tell_unit(unit)
+            return value
+    raise ValueError('too late for a stamp')
+
+
+@cache
+def _tell_unit(unit: str) -> None:
+    _LOGGER.warning('stamps are so large that they are read as %s', unit)
 
 
 def format_stamp_ns(stamp_ns: int) -> str:
@@ -55,7 +81,7 @@ def read_trajectory(path: Path) -> Trajectory:
 
     """
     try:
-        lines = path.read_text(encoding='utf-8').splitlines()
+        lines = path.read_text(encoding='utf-8-sig').splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(f"cannot read the trajectory '{path}': {error}") from error
     poses = [
@@ -67,7 +93,8 @@ def read_trajectory(path: Path) -> Trajectory:
 
 
 def _parse_pose(path: Path, number: int, line: str) -> StampedPose:
-    stamp, _, pose = line.replace(',', ' ').strip().partition(' ')
+    stamp, *words = line.replace(',', ' ').split()
+    pose = ' '.join(words)
     try:
         return StampedPose(parse_stamp_ns(stamp), parse_pose(pose))
     except ValueError as error:

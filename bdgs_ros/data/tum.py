@@ -58,7 +58,7 @@ def read_image_list(path: Path) -> list[ImageFile]:
 
     """
     try:
-        lines = path.read_text(encoding='utf-8').splitlines()
+        lines = path.read_text(encoding='utf-8-sig').splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(f"cannot read the image list '{path}': {error}") from error
     files = [
@@ -78,7 +78,7 @@ def read_image_list(path: Path) -> list[ImageFile]:
 
 
 def _parse_row(path: Path, number: int, line: str) -> ImageFile:
-    words = line.split(maxsplit=1)
+    words = line.replace(',', ' ', 1).split(maxsplit=1)
     try:
         if len(words) != 2:
             raise ValueError(f'{line!r}')

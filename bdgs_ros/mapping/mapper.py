@@ -57,6 +57,7 @@ Seen = TypeVar('Seen')
 _log = logging.getLogger(__name__)
 
 _PHOTOS = 4  # so many earlier keyframes are compared with
+_CLEARLY_MORE = 1.5  # than the budget
 _MIN_BLOB_SHARE = 0.002  # of the image; smaller things in front of the map are noise
 
 
@@ -377,6 +378,12 @@ class Mapper:
             return
         self.map.keep(prune.worth_keeping(self.map, self._config.prune))
         if len(self.map) > budget:
+            if len(self.map) > _CLEARLY_MORE * budget:  # not grown here: of a map that was loaded
+                _log.warning(
+                    '%d Gaussians become %d: to keep them, set mapping.prune.max_gaussians higher',
+                    len(self.map),
+                    budget,
+                )
             config = self._config.merge
             merge_down_to(self.map, round(config.share * budget), config)
         self.map.keep(~prune.least_useful(self.map, len(self.map) - budget))

@@ -228,9 +228,16 @@ def _read_columns(path: Path) -> dict[str, Array]:
         content = path.read_bytes()
     except OSError as error:
         raise MapError(f"map '{path}' cannot be read: {error.strerror}") from error
-    head, mark, body = content.partition(b'end_header\n')
-    lines = head.decode('ascii', errors='replace').split('\n')
-    if not mark or lines[0] != 'ply' or 'format binary_little_endian 1.0' not in lines:
+    head, mark, body = content.partition(b'end_header')
+    end = b'\r\n' if body.startswith(b'\r\n') else b'\n'  # some programs write lines so
+    body = body.removeprefix(end)
+    lines = head.decode('ascii', errors='replace').splitlines()
+    if (
+        not mark
+        or not lines
+        or lines[0] != 'ply'
+        or 'format binary_little_endian 1.0' not in lines
+    ):
         raise MapError(f"'{path}' is not a binary little-endian .ply file")
     count, layout = _layout(path, [line.split() for line in lines])
     expected = count * layout.itemsize

@@ -243,10 +243,12 @@ class SlamNode(GraphNode):
         if not self._config.bag:
             return Path(self._config.output).resolve().name, None
         from bdgs_ros.data.bag import open_bag
-        from bdgs_ros.data.bag_recording import BagRecording
+        from bdgs_ros.data.bag_recording import BagRecording, CameraTopics
 
         with open_bag(self._config.bag) as reader:
-            recording = BagRecording(reader)
+            names = (str(self._values.get(f'{name}_topic', '')) for name in ('color', 'depth'))
+            info = str(self._values.get('info_topic', ''))
+            recording = BagRecording(reader, topics=CameraTopics(*names, info))
             return recording.name, recording.ground_truth
 
     def close(self) -> None:

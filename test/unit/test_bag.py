@@ -370,7 +370,7 @@ def test_images_with_missing_bytes_are_refused() -> None:
 
 def camera_message(**changes: object) -> SimpleNamespace:
     fields = {'width': 32, 'height': 24, 'distortion_model': 'plumb_bob', 'd': np.zeros(5),
-              'k': np.array([30.0, 0, 15, 0, 31, 11, 0, 0, 1])}  # fmt: skip
+              'k': np.array([30.0, 0, 15, 0, 31, 11, 0, 0, 1]), 'p': np.zeros(12)}  # fmt: skip
     return SimpleNamespace(**{**fields, **changes})
 
 
@@ -381,11 +381,48 @@ def test_camera_info() -> None:
     # zero coefficients of any model are no distortion
     other = camera_message(distortion_model='rational_polynomial', d=np.zeros(8))
     assert messages.camera_from_message(other, '/i').is_rectified
-    with pytest.raises(DatasetError, match="'/i': expected distortion model 'plumb_bob'"):
-        messages.camera_from_message(camera_message(distortion_model='equidistant',
-                                                    d=np.ones(4)), '/i')  # fmt: skip
+    with pytest.raises(DatasetError, match="'/i': expected one of the distortion models plumb"):
+        messages.camera_from_message(camera_message(distortion_model='ftheta', d=np.ones(4)), '/i')
+    with pytest.raises(DatasetError, match="'equidistant' with 7 coefficients"):
+        messages.camera_from_message(
+            camera_message(distortion_model='equidistant', d=np.ones(7)), '/i'
+        )
+    with pytest.raises(DatasetError, match='not calibrated'):
+        messages.camera_from_message(camera_message(k=np.full(9, np.nan)), '/i')
     with pytest.raises(DatasetError, match="'/i': camera_info is not calibrated"):
         messages.camera_from_message(camera_message(k=np.zeros(9)), '/i')
+
+
+@pytest.mark.parametrize(
+    ('model', 'given', 'expected_model', 'expected'),
+    [
+        ('plumb_bob', (1, 2, 3, 4), 'plumb_bob', (1, 2, 3, 4, 0)),
+        ('plumb_bob', (1, 2, 3, 4, 5, 0, 0, 0), 'plumb_bob', (1, 2, 3, 4, 5)),
+        ('plumb_bob', (1, 2, 3, 4, 5, 6), 'rational_polynomial', (1, 2, 3, 4, 5, 6, 0, 0)),
+        ('rational_polynomial', (1, 2, 3, 4, 5, 0, 0, 0), 'plumb_bob', (1, 2, 3, 4, 5)),
+        ('rational_polynomial', tuple(range(1, 9)), 'rational_polynomial', tuple(range(1, 9))),
+        ('', (1, 2, 3, 4, 5), 'plumb_bob', (1, 2, 3, 4, 5)),
+        ('equidistant', (1, 2, 3, 4), 'equidistant', (1, 2, 3, 4)),
+        ('fisheye', (1, 2, 3, 4), 'equidistant', (1, 2, 3, 4)),
+    ],
+)
+def test_the_usual_forms_of_distortion(
+    model: str, given: tuple, expected_model: str, expected: tuple
+) -> None:
+    message = camera_message(distortion_model=model, d=np.array(given, float))
+    camera = messages.camera_from_message(message, '/i')
+    assert (camera.distortion_model, camera.distortion) == (expected_model, expected)
+
+
+def test_a_projection_alone_is_a_camera_where_nothing_is_distorted() -> None:
+    projection = np.array([30, 0, 15, 0, 0, 31, 11, 0, 0, 0, 1, 0], float)
+    message = camera_message(k=np.zeros(9), p=projection, d=np.zeros(5))
+    camera = messages.camera_from_message(message, '/i')
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (30, 31, 15, 11)
+    with pytest.raises(DatasetError, match='not calibrated'):
+        messages.camera_from_message(
+            camera_message(k=np.zeros(9), p=projection, d=np.full(5, 0.1)), '/i'
+        )
 
 
 def test_header_stamps_of_ros1_and_of_both_byte_orders() -> None:

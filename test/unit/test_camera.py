@@ -1,5 +1,7 @@
 """Projection, scaling and rectification."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -69,3 +71,20 @@ def test_rectifier_without_distortion_copies_nothing() -> None:
 def test_rectifier_refuses_another_size() -> None:
     with pytest.raises(DatasetError, match=r'depth image has shape \(240, 320\)'):
         Rectifier(FR1).depth(np.zeros((240, 320), np.float32))
+
+
+def test_the_other_models_agree_with_opencv_point_mapping() -> None:
+    many = (0.2, -0.3, 0.001, 0.002, 0.1, 0.1, -0.1, 0.05)
+    rational = replace(FR1, distortion=many, distortion_model='rational_polynomial')
+    fisheye = replace(FR1, distortion=(0.1, -0.05, 0.01, 0.0), distortion_model='equidistant')
+    for camera, undistort in (
+        (rational, cv2.undistortPoints),
+        (fisheye, cv2.fisheye.undistortPoints),
+    ):
+        depth = np.zeros(camera.shape, np.float32)
+        depth[98:103, 448:453] = 2.0
+        point = np.array([[[450.0, 100.0]]])
+        expected = undistort(point, camera.matrix, np.array(camera.distortion), P=camera.matrix)
+        rows, columns = np.nonzero(Rectifier(camera).depth(depth))
+        np.testing.assert_allclose([columns.mean(), rows.mean()], expected[0, 0], atol=0.7)
+        assert Rectifier(camera).camera.is_rectified

@@ -84,7 +84,7 @@ def test_force_replaces_bags_only(tmp_path: Path) -> None:
     assert (folder / 'rgb.txt').is_file()
 
 
-@pytest.mark.parametrize('error', [KeyboardInterrupt, DatasetError, OSError])
+@pytest.mark.parametrize('error', [KeyboardInterrupt, OSError])
 def test_an_interrupted_conversion_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type[BaseException]
 ) -> None:

@@ -179,7 +179,7 @@ def test_eight_bit_depth_is_refused(tmp_path: Path) -> None:
         ('fx:', 'focal: 1\n  fx:', r"unknown keys \['focal'\]"),
         ('fx: 30.0', 'fx: -1', 'above 0'),
         ('fx: 30.0', 'fx: wide', 'could not convert'),
-        ('[0.1,', '[', 'values to unpack'),
+        ('[0.1, -0.05,', '[', 'with 3 coefficients; expected one of plumb_bob with'),
         ('camera:', 'lens:', "no section 'camera'"),
         ('camera:', 'camera: [', 'cannot read the camera file'),
     ],

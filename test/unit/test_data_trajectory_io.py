@@ -79,3 +79,26 @@ def test_a_failed_write_keeps_the_old_file(tmp_path: Path) -> None:
         write_trajectory(tmp_path / 'file' / 'b.txt', Trajectory())
     assert path.read_text() == 'old'
     assert sorted(item.name for item in tmp_path.iterdir()) == ['a.txt', 'file']
+
+
+@pytest.mark.parametrize('unit', [1, 10**3, 10**6, 10**9])
+def test_stamps_in_smaller_units_are_read(unit: int) -> None:
+    assert parse_stamp_ns(str(1403636579 * unit)) == 1403636579 * 10**9
+
+
+@pytest.mark.parametrize('text', ['inf', '-inf', 'nan', '1e40', 'x'])
+def test_no_time_that_can_be_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match='not a stamp'):
+        parse_stamp_ns(text)
+
+
+@pytest.mark.parametrize(
+    'form', ['{0}', '\ufeff{0}', '{0}\r\n', '{0} \t', '{1}', '{2}'], ids=range(6)
+)
+def test_trajectories_as_other_programs_write_them(tmp_path: Path, form: str) -> None:
+    row = '1.5 1 2 3 0 0 0 1'
+    file = tmp_path / 'their.txt'
+    file.write_bytes(form.format(row, row.replace(' ', '\t'), row.replace(' ', ', ')).encode())
+    (pose,) = read_trajectory(file).poses
+    assert pose.stamp_ns == 1_500_000_000
+    assert pose.T_world_camera[:3, 3].tolist() == [1, 2, 3]
