@@ -10,8 +10,13 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1] / 'bdgs_ros'
-STAGES = {'detection', 'tracking', 'belief', 'mapping', 'back_end', 'data', 'eval'}
-SIBLINGS = {('mapping', 'belief'), ('detection', 'tracking'), ('back_end', 'tracking')}
+STAGES = {'detection', 'tracking', 'belief', 'mapping', 'back_end', 'data', 'eval', 'journal'}
+SIBLINGS = {
+    ('mapping', 'belief'),
+    ('detection', 'tracking'),
+    ('back_end', 'tracking'),
+    ('journal', 'mapping'),
+}
 ROS = {'rclpy', 'sensor_msgs', 'geometry_msgs', 'nav_msgs', 'std_msgs', 'std_srvs', 'tf2_msgs'}
 
 

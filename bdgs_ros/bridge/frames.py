@@ -177,6 +177,7 @@ class FrameSource:
         self._health.counts['out_of_order'] = counts.out_of_order
         self._health.counts['duplicates'] = counts.duplicates
         self._health.counts['jumps_back'] = counts.jumps
+        self._health.counts['strange_stamps'] = counts.strange
 
     def _watch(self) -> None:
         logger = self._node.get_logger()

@@ -28,6 +28,8 @@ Item = TypeVar('Item')
 
 _PREDICTED_SHARE = 0.9
 _INTERVALS = 30
+_FAR_AHEAD_NS = 60_000_000_000  # after a pause; or the stamp of one image is wrong
+_CONFIRMED_WITHIN_NS = 2_000_000_000
 
 
 class Patience(Enum):
@@ -48,6 +50,8 @@ class SyncCounts:
     duplicates: int = 0
     out_of_order: int = 0
     jumps: int = 0
+    strange: int = 0
+    """Far from those before, and left out: one alone may be wrong, the next one will tell."""
 
 
 @dataclass
@@ -58,6 +62,8 @@ class _Stream(Generic[Item]):
     newest_ns: int | None = None
     intervals_ns: deque[int] = field(default_factory=lambda: deque(maxlen=_INTERVALS))
     jump_pending: bool = False
+    strange_ns: int | None = None
+    """The last stamp that was far from those before it."""
 
     def append(self, stamp_ns: int, item: Item) -> None:
         if self.newest_ns is not None:
@@ -65,9 +71,14 @@ class _Stream(Generic[Item]):
         self.newest_ns = stamp_ns
         self.items.append((stamp_ns, item))
 
+    def confirms(self, stamp_ns: int) -> bool:
+        """Return whether a stamp far off follows one like it: a single one may be wrong."""
+        before, self.strange_ns = self.strange_ns, stamp_ns
+        return before is not None and 0 < stamp_ns - before <= _CONFIRMED_WITHIN_NS
+
     def restart(self) -> None:
         self.items.clear()
-        self.newest_ns = None
+        self.newest_ns = self.strange_ns = None
         self.intervals_ns.clear()
         self.jump_pending = False
 
@@ -153,14 +164,20 @@ class Synchroniser(Generic[Left, Right]):
         if stream.jump_pending:
             return self._accept_after_jump(stream, other, stamp_ns)
         newest = stream.newest_ns
-        if newest is None or stamp_ns > newest:
+        if newest is None or 0 < stamp_ns - newest <= _FAR_AHEAD_NS:
+            stream.strange_ns = None
             return True
-        if newest - stamp_ns <= self._jump_back_ns:
+        if 0 <= newest - stamp_ns <= self._jump_back_ns:
             if stamp_ns == newest:
                 self.counts.duplicates += 1
             else:
                 self.counts.out_of_order += 1
             return False
+        if not stream.confirms(stamp_ns):
+            self.counts.strange += 1
+            return False
+        if stamp_ns > newest:
+            return True
         stream.restart()
         other.items.clear()
         other.jump_pending = True

@@ -90,12 +90,36 @@ def test_a_jump_back_is_one_event_although_both_streams_jump() -> None:
     sync, jumps = make(Patience.EAGER)
     feed(sync, [5000 * MS, 5033 * MS], [5000 * MS, 5033 * MS])
     assert sync.add_left(0, 10) == []
+    assert jumps == []  # one stamp alone may be wrong
+    assert sync.add_left(33 * MS, 11) == []
     assert jumps == [1]
-    assert sync.add_right(5066 * MS, 11) == []  # the last one from before the jump
-    assert sync.add_right(1 * MS, 12) == [(10, 12)]
+    assert sync.add_right(5066 * MS, 12) == []  # the last one from before the jump
+    assert sync.add_right(34 * MS, 13) == [(11, 13)]
     assert jumps == [1]
-    assert sync.add_left(33 * MS, 13) == []
-    assert sync.add_right(34 * MS, 14) == [(13, 14)]
+    assert sync.add_left(66 * MS, 14) == []
+    assert sync.add_right(67 * MS, 15) == [(14, 15)]
+
+
+@pytest.mark.parametrize('off_s', [3600, 100, -10, -3600])
+def test_one_stamp_that_is_far_off_costs_itself_alone(off_s: int) -> None:
+    sync, jumps = make(Patience.EAGER)
+    pairs = []
+    for i in range(10):
+        at = 10**13 + i * 33 * MS
+        pairs += sync.add_left(at + off_s * 1000 * MS if i == 5 else at, i)
+        pairs += sync.add_right(at, i)
+    assert pairs == [(i, i) for i in range(10) if i != 5]
+    assert jumps == [] and sync.counts.strange == 1
+
+
+def test_a_pause_is_gone_on_after() -> None:
+    sync, jumps = make(Patience.EAGER)
+    pairs = []
+    for i in range(6):
+        at = i * 33 * MS + (3600 * 1000 * MS if i >= 3 else 0)
+        pairs += [*sync.add_left(at, i), *sync.add_right(at, i)]
+    assert pairs == [(i, i) for i in range(6) if i != 3]
+    assert jumps == []
 
 
 def test_a_stream_without_partner_does_not_pile_up() -> None:
