@@ -1,10 +1,10 @@
-# make install | demo | test | check | bench | cuda-check (docs/cuda.md)
+# make install | demo | test | check | fuzz | bench | cuda-check (docs/cuda.md)
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: install demo test check bench cuda-check wheels clean
+.PHONY: install demo test check fuzz bench cuda-check wheels clean
 
 install: $(STAMP)
 
@@ -24,6 +24,10 @@ check: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# ten minutes of strange input, other than the last time
+fuzz: install
+	BDGS_FUZZ=long $(BIN)/python3 -m pytest -q --hypothesis-show-statistics test/unit/test_fuzz.py
 
 bench: install
 	$(BIN)/bdgs bench slam

@@ -176,7 +176,7 @@ setup(
     extras_require={
         # rclpy from pip; leave it out in a ROS 2 workspace, which brings its own
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
-        'test': ['pytest', 'mypy', 'ruff', 'evo', 'cyclonedds', 'psutil'],
+        'test': ['pytest', 'mypy', 'ruff', 'evo', 'cyclonedds', 'psutil', 'hypothesis'],
     },
     zip_safe=False,
     maintainer='bdgs_ros maintainers',

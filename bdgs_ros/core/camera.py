@@ -20,6 +20,9 @@ and a tilted sensor, as OpenCV orders them; k1 to k4 of `cv2.fisheye`.
 """
 
 
+_OUTSIDE = -1.0  # of any image
+
+
 @dataclass(frozen=True)
 class PinholeCamera:
     """
@@ -147,7 +150,9 @@ class Rectifier:
         return (
             np.asarray(fixed, dtype=np.int16),
             np.asarray(fraction, dtype=np.uint16),
-            np.rint(nearest).astype(np.int16),
+            np.rint(np.clip(np.nan_to_num(nearest, nan=_OUTSIDE), _OUTSIDE, 1 << 14)).astype(
+                np.int16
+            ),
         )
 
     def color(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:

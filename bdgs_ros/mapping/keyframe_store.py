@@ -172,7 +172,12 @@ def _intrinsics(camera: PinholeCamera) -> dict[str, float]:
 def gaussians_of(folder: Path) -> int | None:
     """Return the size of the map that a folder of keyframes belongs to; None if any will do."""
     count = _read_document(folder)['bdgs'].get('gaussians')
-    return None if count is None else int(count)
+    if count is not None and not isinstance(count, int):
+        raise MapError(
+            f"'{folder / TRANSFORMS}' is damaged: expected a count of Gaussians, found {count!r}; "
+            f"remove '{folder}' to use the map without its keyframes"
+        )
+    return count
 
 
 def read_keyframes(folder: Path, levels: int) -> KeyframeSet:
