@@ -216,7 +216,7 @@ def keyframes_from(document: Mapping[str, Any], folder: Path, levels: int) -> Ke
         index_of = {int(s): int(index) for s, index in own.get('index_of', {}).items()}
         readout = own.get('readout_s')
         readout_s = None if readout is None else float(readout)
-    except (KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise MapError(
             f"'{folder / TRANSFORMS}' is damaged: {type(error).__name__} {error}; "
             f"remove '{folder}' to use the map without its keyframes"
