@@ -17,7 +17,7 @@ import numpy as np
 
 from bdgs_ros.bench import sequences
 from bdgs_ros.bench.harness import Cell, Options
-from bdgs_ros.bench.live import bag_of, graph_values, run_graph
+from bdgs_ros.bench.live import bag_of, children_of, graph_values, run_graph
 from bdgs_ros.bench.sequences import REAL
 from bdgs_ros.core import se3
 from bdgs_ros.core.types import Trajectory
@@ -129,16 +129,6 @@ class _Killer:
         )
         later = [float(stamp) - self._killed_s for stamp in said]
         return min((seconds for seconds in later if seconds > 0), default=None)
-
-
-def children_of(pid: int, module: str) -> list[int]:
-    """Return the children of a process that run a module (Linux)."""
-    found = Path(f'/proc/{pid}/task/{pid}/children').read_text(encoding='ascii').split()
-    return [
-        int(child)
-        for child in found
-        if module in Path(f'/proc/{child}/cmdline').read_bytes().decode().split('\0')
-    ]
 
 
 def errors_after(truth: Trajectory, online: Trajectory, before: int | None) -> dict[str, Any]:

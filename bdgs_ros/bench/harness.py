@@ -92,6 +92,8 @@ class Options:
     """Of the replay, of live runs."""
     jobs: int = 1
     """Cells that run at once, where the bench allows it."""
+    minutes: float = 10.0
+    """For how long the graph is disturbed."""
 
 
 _RunCell = Callable[[Cell, Options], dict[str, Any]]

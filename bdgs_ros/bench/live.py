@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -61,8 +61,25 @@ def busy_processes(count: int) -> Iterator[None]:
             process.wait()
 
 
+def children_of(pid: int, module: str) -> list[int]:
+    """Return the children of a process that run a module (Linux)."""
+    path = Path(f'/proc/{pid}/task/{pid}/children')
+    found = path.read_text(encoding='ascii').split() if path.exists() else []
+    return [int(child) for child in found if module in _command(int(child))]
+
+
+def _command(pid: int) -> list[str]:
+    """Return the command line of a process; nothing if it has ended."""
+    with suppress(OSError):
+        return Path(f'/proc/{pid}/cmdline').read_bytes().decode().split('\0')
+    return []
+
+
 def run_graph(
-    values: Mapping[str, Any], log: Path, watch: Callable[[int], None] = lambda pid: None
+    values: Mapping[str, Any],
+    log: Path,
+    watch: Callable[[int], None] = lambda pid: None,
+    timeout_s: float = _TIMEOUT_S,
 ) -> None:
     """
     Run slam_node to its end.
@@ -75,6 +92,8 @@ def run_graph(
         Where its output goes.
     watch : callable
         Called with its process id once it runs.
+    timeout_s : float
+        For all of it.
 
     Raises
     ------
@@ -95,7 +114,7 @@ def run_graph(
         process = subprocess.Popen(command, env=environment, stdout=file, stderr=subprocess.STDOUT)
         try:
             watch(process.pid)
-            status = process.wait(_TIMEOUT_S)
+            status = process.wait(timeout_s)
         except subprocess.TimeoutExpired as error:
             raise BdgsError(f"the graph did not end ({error}); see '{log}'") from error
         finally:

@@ -18,7 +18,7 @@ NAME = 'bench'
 HELP = 'measure accuracy or speed; finished cells are kept, so an interrupted bench goes on'
 
 _BENCHES = (
-    *('slam', 'accuracy', 'belief', 'mapping', 'tracking', 'recovery', 'faults'),
+    *('slam', 'accuracy', 'belief', 'mapping', 'tracking', 'recovery', 'faults', 'soak'),
     *('rasterizer', 'card'),
 )
 
@@ -88,6 +88,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument('--weights', type=Path, metavar='ONNX', help='weights of the detector')
     parser.add_argument(
+        '--minutes',
+        type=float,
+        default=10.0,
+        metavar='M',
+        help='bench soak: for how long (default: %(default)g)',
+    )
+    parser.add_argument(
         '--set',
         action='append',
         default=[],
@@ -122,6 +129,7 @@ def run(arguments: argparse.Namespace) -> int:
         beside=tuple(arguments.beside or Options.beside),
         rates=tuple(arguments.rate or Options.rates),
         jobs=arguments.jobs,
+        minutes=arguments.minutes,
     )
     results = run_bench(bench, options, arguments.only, arguments.force)
     sys.stdout.write(dump_json(results) + '\n' if arguments.json else to_markdown(results))
