@@ -92,12 +92,13 @@ class Adjuster:
         with self._busy:
             self._back_end.start_from(readout_s)
 
-    def resume(self, last: StampedPose) -> None:
+    def resume(self, last: StampedPose | None) -> None:
         """Go on with the mapper's keyframes; `last` is the newest, as tracking gave it."""
         self.start_from(self._mapper.readout_s)
         with self._lock:
             self._poses = self._mapper.keyframe_poses()
-            self._moves = self._mapper.history.moves_since(last.stamp_ns)
+            if last is not None:
+                self._moves = self._mapper.history.moves_since(last.stamp_ns)
             self._last = last
 
     def adjust(self, keyframe: Keyframe, tracked: Iterable[StampedPose]) -> Adjustment | None:
@@ -143,6 +144,13 @@ class Adjuster:
         with self._lock:
             if self._at_once:
                 self._moves = [*self._moves, (stamp_ns, T_new_old)]
+
+    def reenter(self, last_ns: int, T_new_old: Pose) -> None:
+        """Take that tracking began again after a frame, see `History.reenter`."""
+        with self._lock:
+            if self._at_once:
+                kept = [move for move in self._moves if move[0] <= last_ns]
+                self._moves = [*kept, (last_ns + 1, T_new_old)]
 
     def note_piece(self, first_ns: int, last_ns: int) -> None:
         """Take the time during which a piece of map was made that is part of the world now."""

@@ -64,8 +64,9 @@ class Feedback:
         self.loaded_map = ''
         """The file of the map that mapping has loaded at run time and still has."""
         self._is_replaced = False
-        self.goes_on = False
-        """Whether there are poses of a run before, whose map mapping should have."""
+        self.goes_on = config.resume
+        """Whether mapping may have the map of a run before, which this one goes on with."""
+        self._has_heard_of_map = False
         self._request = node.create_publisher(Empty, topics.MAP_REQUEST, topics.RELIABLE)
         node.create_subscription(Bool, topics.LOCALIZATION, self._on_localization, topics.LATCHED)
         node.create_subscription(String, topics.MAP_LOADED, self._on_map_loaded, topics.LATCHED)
@@ -92,7 +93,9 @@ class Feedback:
         self._map_is_frozen = message.data
 
     def _on_map_loaded(self, message: String) -> None:
-        self.loaded_map, self._is_replaced = message.data, bool(message.data)
+        is_news = self._has_heard_of_map or not self.goes_on  # else it was loaded in that run
+        self._has_heard_of_map = True
+        self.loaded_map, self._is_replaced = message.data, bool(message.data) and is_news
 
     def map_was_replaced(self) -> bool:
         """Return whether mapping has loaded another map since the last call."""

@@ -82,6 +82,11 @@ class PoseOutput:
         """The poses published so far."""
         return Trajectory(tuple(self._poses))
 
+    @property
+    def newest_ns(self) -> int:
+        """Stamp of the last pose; 0 before the first."""
+        return self._poses[-1].stamp_ns if self._poses else 0
+
     def clear(self) -> None:
         """Forget the trajectory."""
         self._poses, self._previous = [], None

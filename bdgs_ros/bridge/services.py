@@ -103,4 +103,8 @@ def _answer(node: Node, name: str, response: Any, action: Callable[[], str]) -> 
         response.message = str(error)
         response.success = False
         node.get_logger().error(f'{name}: {error}')
+    except Exception as error:  # nobody shall wait in vain, or find nobody the next time
+        response.message = f'{type(error).__name__}: {error}'
+        response.success = False
+        node.get_logger().error(f'{name}: please report: {response.message}')
     return response

@@ -29,7 +29,7 @@ Item = TypeVar('Item')
 _PREDICTED_SHARE = 0.9
 _INTERVALS = 30
 _FAR_AHEAD_NS = 60_000_000_000  # after a pause; or the stamp of one image is wrong
-_CONFIRMED_WITHIN_NS = 2_000_000_000
+_CONFIRMED_WITHIN_NS = 10_000_000_000
 
 
 class Patience(Enum):
@@ -173,7 +173,8 @@ class Synchroniser(Generic[Left, Right]):
             else:
                 self.counts.out_of_order += 1
             return False
-        if not stream.confirms(stamp_ns):
+        # Whoever is sent pairs one by one, and waited for, takes them as they are.
+        if self._patience is Patience.PREDICT and not stream.confirms(stamp_ns):
             self.counts.strange += 1
             return False
         if stamp_ns > newest:

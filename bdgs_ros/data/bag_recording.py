@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,7 @@ DEPTH_TOPIC = '/camera/depth/image_raw'
 INFO_TOPIC = '/camera/color/camera_info'
 GROUND_TRUTH_TOPIC = '/ground_truth/pose'
 
+_FIRST_FEW = 5
 _COMPRESSED = ('/compressed',)
 _COMPRESSED_DEPTH = ('/compressedDepth', '/compressed')
 
@@ -191,8 +193,11 @@ class BagRecording:
         return found
 
     def _shape_of_color(self) -> tuple[int, int] | None:
-        for _, message in self.reader.messages([self.layout.color]):
-            return self._decode_color(message).shape[:2]
+        for _, (_, message) in zip(
+            range(_FIRST_FEW), self.reader.messages([self.layout.color]), strict=False
+        ):
+            with suppress(DatasetError):  # a damaged one costs itself alone
+                return self._decode_color(message).shape[:2]
         return None
 
     def color_name(self, index: int) -> str:

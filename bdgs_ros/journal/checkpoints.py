@@ -149,7 +149,7 @@ def _read_if_whole(
 ) -> tuple[GaussianMap, KeyframeSet] | None:
     try:
         return _read(path, belief, mapping)
-    except BdgsError as error:
+    except (BdgsError, OSError) as error:  # it may just be removed
         _log.warning('%s', error)
         return None
 

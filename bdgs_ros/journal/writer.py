@@ -44,7 +44,8 @@ class RecordWriter:
         self._is_new = not keep
         self._file: BinaryIO | None = None
         self._problem = ''
-        self._stop = threading.Event()
+        self._is_over = False
+        self._wake = threading.Event()
         self._thread = threading.Thread(target=self._run, name='journal', daemon=True)
         self._thread.start()
 
@@ -58,14 +59,18 @@ class RecordWriter:
         with self._lock:
             self._waiting = []
             self._is_new = True
+        self._wake.set()  # what is of another world must not be there when this process dies
 
     def close(self) -> None:
         """Write what waits, and end."""
-        self._stop.set()
+        self._is_over = True
+        self._wake.set()
         self._thread.join()
 
     def _run(self) -> None:
-        while not self._stop.wait(PERIOD_S):
+        while not self._is_over:
+            self._wake.wait(PERIOD_S)
+            self._wake.clear()
             self._flush()
         self._flush()
         if self._file is not None:
@@ -75,6 +80,8 @@ class RecordWriter:
         with self._lock:
             taken, self._waiting = self._waiting, []
             is_new, self._is_new = self._is_new, False
+        if not taken and not is_new:
+            return
         try:
             problem = self._append(b''.join(taken), is_new)
         except (OSError, JournalError) as error:

@@ -116,13 +116,22 @@ class History:
         pieces: Sequence[Sequence[StampedPose]],
     ) -> None:
         """Take what tracking said after a frame, some of it while nobody heard."""
-        told = {move.stamp_ns: move.T_world_camera for move in moves if move.stamp_ns > since_ns}
-        known = [move for move in self._moves if move[0] not in told]
-        self._moves = sorted((*known, *told.items()), key=itemgetter(0))
+        told = [(m.stamp_ns, m.T_world_camera) for m in moves if m.stamp_ns > since_ns]
+        for piece in pieces:
+            if piece:
+                told = seen_from(told, piece[0].stamp_ns, piece[-1].stamp_ns)
+        stamps = {stamp_ns for stamp_ns, _ in told}
+        known = [move for move in self._moves if move[0] not in stamps]
+        self._moves = sorted((*known, *told), key=itemgetter(0))
         joined = {pose.stamp_ns for pose in self._joined}
         for piece in pieces:
             if piece and piece[0].stamp_ns not in joined:
                 self.join(piece)
+
+    def reenter(self, last_ns: int, T_new_old: Pose) -> None:
+        """Note that tracking began again, in the world as it is: what it moved since is void."""
+        self._moves = [move for move in self._moves if move[0] <= last_ns]
+        self.note_move(last_ns + 1, T_new_old)
 
     def moves_since(self, stamp_ns: int) -> list[Move]:
         """Return by what tracking moved its world after a frame."""

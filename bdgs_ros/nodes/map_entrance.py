@@ -43,9 +43,9 @@ class MapEntrance:
         Of the view at most, in pixels.
     put : callable
         Has a task done by the thread that may use the map.
-    note_move : callable
-        Called with a stamp and `T_new_old` where tracking comes in again: it was in a world as
-        that was before corrections that it has not heard of.
+    reenter : callable
+        Called with the stamp of the last frame before tracking comes in again, and `T_new_old`:
+        it was in a world as that was before corrections that it has not heard of.
 
     """
 
@@ -59,7 +59,7 @@ class MapEntrance:
         health: Health,
         width: int,
         put: Callable[[Callable[[], None]], None],
-        note_move: Callable[[int, Pose], None],
+        reenter: Callable[[int, Pose], None],
     ) -> None:
         self._node = node
         self._live = live
@@ -69,7 +69,7 @@ class MapEntrance:
         self._health = health
         self._width = width
         self._put = put
-        self._note_move = note_move
+        self._reenter = reenter
         self._newest: RawFrame | None = None
         self._is_asked = False
         self.is_waited_for = False
@@ -87,6 +87,7 @@ class MapEntrance:
     def forget(self) -> None:
         """Wait for a camera again."""
         self._newest = None
+        self._is_asked = self.is_waited_for = False
 
     def _on_request(self) -> None:
         self._live.is_entered = True
@@ -99,7 +100,7 @@ class MapEntrance:
             self._put(partial(self._show, self._newest))
 
     def _show(self, raw: RawFrame) -> None:
-        view = None
+        view, is_answer = None, True
         try:
             camera = self._decoder.camera(raw)
             self._output.see_through(camera, raw.color.header.frame_id)
@@ -112,9 +113,11 @@ class MapEntrance:
                 check_entrance(view, Path(str(file or 'the map')))
         except BdgsError as error:
             self._health.error(error)
-        finally:  # an empty answer says that there is no map
+            is_answer = not self._live.poses  # tracking was in this map: it asks again
+        finally:
             self.is_waited_for = False
-            self._models.publish(NO_KEYFRAME_NS, view)
+            if is_answer:  # an empty one says that there is no map
+                self._models.publish(NO_KEYFRAME_NS, view)
 
     def _where_it_starts(self) -> Pose:
         """Return where the camera was last, if tracking asks because it was restarted."""
@@ -124,5 +127,5 @@ class MapEntrance:
         now = self._live.mapper.final_pose(last.stamp_ns, last.T_world_camera)
         if last.stamp_ns != self._left_ns:  # it may ask twice
             self._left_ns = last.stamp_ns
-            self._note_move(last.stamp_ns + 1, now @ se3.inverse(last.T_world_camera))
+            self._reenter(last.stamp_ns, now @ se3.inverse(last.T_world_camera))
         return now

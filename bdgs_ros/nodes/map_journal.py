@@ -9,7 +9,6 @@ from pathlib import Path
 from bdgs_ros.bridge.health import Health
 from bdgs_ros.bridge.node_config import MappingNodeConfig
 from bdgs_ros.bridge.priority import give_way
-from bdgs_ros.core.types import StampedPose
 from bdgs_ros.journal.checkpoints import Checkpoints, read_newest
 from bdgs_ros.journal.folder import map_folder, poses_file
 from bdgs_ros.journal.keeper import MapKeeper
@@ -38,23 +37,16 @@ class MapJournal:
         self._live = live
         self._health = health
         self._keeper: MapKeeper | None = None
-        self._kept_version = 0
-        self._since_ns: int | None = None  # the newest keyframe of the map that was taken up
         self._checkpoints: Checkpoints | None = None
+        self._kept_version = 0
+        self._goes_on = False  # with a run that began before this process
+        self._since_ns: int | None = None  # the newest keyframe of the map that was taken up
 
-    def begin(self) -> StampedPose | None:
-        """
-        Take up the map that is there, if that is wanted, and keep it from now on.
-
-        Returns
-        -------
-        last : StampedPose or None
-            The newest keyframe of the map that was taken up, as tracking gave it.
-
-        """
+    def begin(self) -> bool:
+        """Take up the map that is there, if that is wanted, and keep it from now on."""
         folder = self._config.journal_folder
         if folder is None:
-            return None
+            return False
         kept = self._take_up(folder) if self._config.resume else None
         self._checkpoints = Checkpoints(map_folder(folder), kept)
         if kept is None and not self._live.mapper.frozen:
@@ -64,12 +56,13 @@ class MapJournal:
             partial(self._health.set_problem, 'journal'),
             partial(give_way, self._config.mapping_nice),
         )
-        return None if kept is None else self._live.mapper.history.newest
+        return kept is not None
 
     def _take_up(self, folder: Path) -> KeyframeSet | None:
         """Go on with the poses, and with the map if it is of the same world."""
         live, config = self._live, self._config
         told = read_told(poses_file(folder))
+        self._goes_on = True
         live.poses = list(told.poses)
         if live.mapper.frozen or not told.poses:
             return None
@@ -78,28 +71,30 @@ class MapJournal:
             return None
         gaussians, kept = found
         newest = kept.history.newest
-        if newest is None or newest.stamp_ns < told.poses[0].stamp_ns:  # of a world before
+        if newest is not None and newest.stamp_ns < told.poses[0].stamp_ns:  # of a world before
             return None
         live.mapper.take(gaussians, kept)
         live.version += 1
-        self._since_ns = newest.stamp_ns
+        self._since_ns = 0 if newest is None else newest.stamp_ns
         self._hear(told)
         return kept
 
     def catch_up(self) -> None:
         """Take what tracking said while mapping was not there, and what it had not written yet."""
         folder = self._config.journal_folder
-        if folder is not None and self._since_ns is not None:
+        if folder is not None and self._goes_on:
             self._hear(read_told(poses_file(folder)))
 
     def _hear(self, told: Told) -> None:
-        assert self._since_ns is not None
-        poses = self._live.poses
-        known = {pose.stamp_ns for pose in poses}
-        poses += [pose for pose in told.poses if pose.stamp_ns not in known]
-        poses.sort(key=attrgetter('stamp_ns'))  # in one step: newer ones come meanwhile
         with self._live.lock:
-            self._live.mapper.history.catch_up(self._since_ns, told.moves, told.pieces)
+            if not self._goes_on:  # all was forgotten meanwhile
+                return
+            poses = self._live.poses
+            known = {pose.stamp_ns for pose in poses}
+            poses += [pose for pose in told.poses if pose.stamp_ns not in known]
+            poses.sort(key=attrgetter('stamp_ns'))  # in one step: newer ones come meanwhile
+            if self._since_ns is not None:
+                self._live.mapper.history.catch_up(self._since_ns, told.moves, told.pieces)
 
     def keep(self) -> None:
         """Have the map written if it is time, and it has changed; its owner has locked it."""
@@ -110,9 +105,13 @@ class MapJournal:
             self._kept_version = version
             self._keeper.put(self._checkpoints.state(mapper.map, mapper.kept()))
 
+    def part(self) -> None:
+        """Take that the world is given up: nothing that was said before is of the next one."""
+        self._goes_on, self._since_ns = False, None
+
     def forget(self) -> None:
         """Take that the map was forgotten."""
-        self._since_ns = None
+        self.part()
         if self._keeper is not None:
             self._keeper.forget()
 

@@ -108,7 +108,7 @@ class MappingNode(GraphNode):
         )
         self._entrance = MapEntrance(
             self, self._live, self._decoder, self._models, self._output, self._health,
-            config.mapping.width, self._worker.put, self._note_motion,
+            config.mapping.width, self._worker.put, self._reenter,
         )  # fmt: skip
         self._journal = MapJournal(config, self._live, self._health)
         self._subscribe()
@@ -118,9 +118,8 @@ class MappingNode(GraphNode):
 
     def _take_up(self) -> None:
         """Go on with what a run before has left, if that is wanted."""
-        last = self._journal.begin()
-        if last is not None:
-            self._back_end.resume(last)
+        if self._journal.begin():
+            self._back_end.resume(self._mapper.history.newest)
             self._publish_keyframes(self._mapper.keyframe_poses())
             self.get_logger().info(
                 f'going on with {len(self._live.poses)} poses and {len(self._mapper.map)} '
@@ -181,12 +180,13 @@ class MappingNode(GraphNode):
     def _note_move(self, message: PoseStamped) -> None:
         if self._live.is_entered:
             T_new_old = conversions.motion_from_message(message)
-            self._note_motion(conversions.stamp_ns(message), T_new_old)
+            self._mapper.history.note_move(conversions.stamp_ns(message), T_new_old)
+            self._back_end.note_move(conversions.stamp_ns(message), T_new_old)
 
-    def _note_motion(self, stamp_ns: int, T_new_old: Pose) -> None:
-        """Take by what the world was moved, for tracking, before a frame."""
-        self._mapper.history.note_move(stamp_ns, T_new_old)
-        self._back_end.note_move(stamp_ns, T_new_old)
+    def _reenter(self, last_ns: int, T_new_old: Pose) -> None:
+        """Take that tracking was restarted, and begins in the map as it is."""
+        self._mapper.history.reenter(last_ns, T_new_old)
+        self._back_end.reenter(last_ns, T_new_old)
 
     def _queue_keyframe(self, message: PoseStamped) -> None:
         stamp_ns = conversions.stamp_ns(message)
@@ -373,6 +373,7 @@ class MappingNode(GraphNode):
 
     def _forget(self) -> None:
         self._frames.clear()
+        self._journal.part()
         self._live.poses, self._live.is_entered = [], True
         self._entrance.forget()
         self._tracked.clear()

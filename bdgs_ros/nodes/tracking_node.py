@@ -62,6 +62,7 @@ class TrackingNode(GraphNode):
         self._newest: RgbdFrame | None = None  # to measure that by
         self._joined: list[Piece] = []  # that mapping is to hear of
         self._late_places: list[Keyframe] = []  # that the tracker does not know yet
+        self._world = 0  # counts: what was read for one is nothing to the next
         self._output = PoseOutput(self, config, self._health)
         self._status = self.create_publisher(DiagnosticArray, topics.STATUS, topics.RELIABLE)
         self._offset = self.create_publisher(Float64, topics.DEPTH_OFFSET, topics.LATCHED)
@@ -82,7 +83,6 @@ class TrackingNode(GraphNode):
         serve_switch(self, topics.PAUSE, self._on_pause)
         serve_trigger(self, topics.SAVE_TRAJECTORY, self._on_save)
         self._source = FrameSource(self, config, self._health, self._put, self._forget)
-        self._feedback.goes_on = bool(len(self._output.trajectory))
         self.get_logger().info(f'tracking is ready: mode {config.mode}')
 
     def _put(self, raw: RawFrame) -> None:
@@ -125,6 +125,11 @@ class TrackingNode(GraphNode):
 
     def _begin(self, frame: RgbdFrame) -> bool:
         """Begin at the origin of a new world, or in a map once mapping has shown it."""
+        if self._feedback.goes_on and frame.stamp_ns <= self._output.newest_ns:
+            self._begin_anew(
+                f'the first image, at {frame.stamp_ns} ns, is not newer than the last pose of the '
+                f'journal, at {self._output.newest_ns} ns'
+            )
         if self._feedback.begins_in_map:
             answered, view = self._feedback.entrance(frame.camera)
             waiting = '' if answered else 'LOST: mapping has not shown the map to begin in'
@@ -135,23 +140,34 @@ class TrackingNode(GraphNode):
                 if self._feedback.goes_on and not self._config.lockstep:
                     # It is most likely where it was last: the rest can come later.
                     self._tracker.start_from(view)
-                    threading.Thread(target=self._read_places, daemon=True).start()
+                    threading.Thread(
+                        target=self._read_places, args=[self._world], daemon=True
+                    ).start()
                 else:
                     self._tracker.start_from(view, self._places())
                 self._explorer.reset(is_known=True)
             elif self._feedback.goes_on:
-                self.get_logger().warning(
-                    'there is no map left of the world that the trajectory is in: another begins'
-                )
-                self._output.clear()
+                self._begin_anew('mapping has no map of the world that the trajectory is in')
         self._has_begun = True
         return True
 
-    def _read_places(self) -> None:
+    def _begin_anew(self, why: str) -> None:
+        """Give up what the journal holds, here and in mapping: it cannot be gone on with."""
+        if len(self._output.trajectory):
+            self.get_logger().warning(f'another world begins: {why}')
+        self._feedback.goes_on = False
+        self._feedback.forget_map()
+        self._output.clear()
+        self._reset_event.publish(Empty())
+
+    def _read_places(self, world: int) -> None:
         try:
-            self._late_places = self._places()
-        except BdgsError as error:
+            places = self._places()
+        except (BdgsError, OSError) as error:
             self._health.error(error)
+            return
+        if world == self._world:
+            self._late_places = places
 
     def _learn_places(self) -> None:
         late, self._late_places = self._late_places, []
@@ -161,8 +177,9 @@ class TrackingNode(GraphNode):
     def _places(self) -> list[Keyframe]:
         """Read the keyframes of the map that mapping has: the camera may be anywhere in it."""
         folder = self._config.journal_folder
-        if self._feedback.goes_on and folder is not None:
-            return read_places(map_folder(folder))
+        kept = read_places(map_folder(folder)) if self._feedback.goes_on and folder else []
+        if kept:
+            return kept
         begun = str(self.get_parameter('map_file').value) if self._config.begins_in_map else ''
         file = self._feedback.loaded_map or begun
         if not file:
@@ -223,6 +240,8 @@ class TrackingNode(GraphNode):
         """Begin anew with a piece of map, all of which was seen since the camera was lost."""
         self._feedback.forget_map()
         self._feedback.clear()
+        self._world += 1
+        self._late_places = []
         self._output.clear()
         self._reset_event.publish(Empty())
         self._tracker.start_from(piece.entrance())
@@ -301,6 +320,8 @@ class TrackingNode(GraphNode):
         self.get_logger().info('reset: the next frame is the origin')
 
     def _start_over(self) -> None:
+        self._world += 1
+        self._late_places = []
         self._tracker.reset()
         self._explorer.reset()
         self._joined = []

@@ -124,3 +124,38 @@ def test_a_run_does_not_go_on_unasked(
     assert again.wait(120.0) == 0, again.text()
     assert 'going on with' not in again.text()
     assert len(read_trajectory(output / 'trajectory.txt')) <= len(BagSequence(bag))
+
+
+def test_without_a_journal_a_killed_tracker_still_asks_for_its_world(
+    graph: Graph, bag: Path, settings: dict[str, object], tmp_path: Path
+) -> None:
+    output = tmp_path / 'out'
+    slam = graph.node(
+        'slam_node', bag=bag, output=output, rate=RATE, exit_at_end=True,
+        journal__enabled=False, **settings,
+    )  # fmt: skip
+    slam.wait_for('playing', 60.0)
+    time.sleep(2.0)
+    (pid,) = (pid for pid, line in children(slam).items() if 'tracking_node' in line)
+    os.kill(pid, signal.SIGKILL)
+    assert slam.wait(120.0) == 0, slam.text()
+    final = read_trajectory(output / 'trajectory_final.txt')
+    assert len(final) > len(read_trajectory(output / 'trajectory.txt'))
+    truth = BagSequence(bag).ground_truth
+    assert truth is not None and ate(truth, final).statistics.max < FAR_M
+
+
+def test_stamps_from_before_the_journal_begin_another_world(
+    graph: Graph, bag: Path, settings: dict[str, object], tmp_path: Path
+) -> None:
+    output = tmp_path / 'out'
+    slam = graph.node('slam_node', bag=bag, output=output, rate=RATE, **settings)
+    wait_for_poses(slam, output / 'journal', 6)
+    slam.stop(signal.SIGINT)
+    again = graph.node(
+        'slam_node', bag=bag, output=output, resume=True, exit_at_end=True, **settings
+    )
+    assert again.wait(120.0) == 0, again.text()
+    assert 'another world begins: the first image' in again.text()
+    online = read_trajectory(output / 'trajectory.txt')
+    assert len(set(online.stamps_ns.tolist())) == len(online) <= len(BagSequence(bag))

@@ -87,22 +87,30 @@ def test_duplicates_and_small_steps_back_are_dropped_and_counted() -> None:
 
 
 def test_a_jump_back_is_one_event_although_both_streams_jump() -> None:
-    sync, jumps = make(Patience.EAGER)
+    sync, jumps = make(Patience.PREDICT)
     feed(sync, [5000 * MS, 5033 * MS], [5000 * MS, 5033 * MS])
     assert sync.add_left(0, 10) == []
     assert jumps == []  # one stamp alone may be wrong
     assert sync.add_left(33 * MS, 11) == []
     assert jumps == [1]
     assert sync.add_right(5066 * MS, 12) == []  # the last one from before the jump
-    assert sync.add_right(34 * MS, 13) == [(11, 13)]
+    pairs = [*sync.add_right(34 * MS, 13), *sync.add_left(66 * MS, 14)]
+    pairs += [*sync.add_right(67 * MS, 15), *sync.flush()]
+    assert pairs == [(11, 13), (14, 15)]
     assert jumps == [1]
-    assert sync.add_left(66 * MS, 14) == []
-    assert sync.add_right(67 * MS, 15) == [(14, 15)]
+
+
+def test_who_is_sent_pairs_one_by_one_takes_a_jump_at_once() -> None:
+    sync, jumps = make(Patience.EAGER)
+    feed(sync, [5000 * MS], [5000 * MS])
+    assert sync.add_left(0, 10) == []
+    assert sync.add_right(1 * MS, 11) == [(10, 11)]
+    assert jumps == [1]
 
 
 @pytest.mark.parametrize('off_s', [3600, 100, -10, -3600])
 def test_one_stamp_that_is_far_off_costs_itself_alone(off_s: int) -> None:
-    sync, jumps = make(Patience.EAGER)
+    sync, jumps = make(Patience.PREDICT)
     pairs = []
     for i in range(10):
         at = 10**13 + i * 33 * MS
@@ -113,7 +121,7 @@ def test_one_stamp_that_is_far_off_costs_itself_alone(off_s: int) -> None:
 
 
 def test_a_pause_is_gone_on_after() -> None:
-    sync, jumps = make(Patience.EAGER)
+    sync, jumps = make(Patience.PREDICT)
     pairs = []
     for i in range(6):
         at = i * 33 * MS + (3600 * 1000 * MS if i >= 3 else 0)

@@ -260,5 +260,27 @@ def test_a_history_hears_what_was_said_while_mapping_was_away() -> None:
     assert [stamp_ns for stamp_ns, _ in history.moves_since(20)] == [25, 28]
     completed = history.completed(Trajectory((StampedPose(25, at(2)),)))
     assert [p.stamp_ns for p in completed.poses] == [25, 26, 27]
-    history.catch_up(20, [], [[StampedPose(26, at(2)), StampedPose(27, at(2))]])
+    history.catch_up(
+        20,
+        [StampedPose(25, at(4)), StampedPose(28, at(5))],
+        [[StampedPose(26, at(2)), StampedPose(27, at(2))]],
+    )
     assert len(history.completed(Trajectory(())).poses) == 2
+
+
+def test_a_move_amid_a_piece_is_heard_once() -> None:
+    history = History()
+    history.add(100, at(0))
+    piece = [StampedPose(200, at(2)), StampedPose(300, at(2))]
+    for _ in range(2):
+        history.catch_up(100, [StampedPose(250, at(3))], [piece])
+        assert [stamp_ns for stamp_ns, _ in history.moves_since(0)] == [200]
+
+
+def test_what_was_moved_before_tracking_began_again_is_void() -> None:
+    history = History()
+    history.add(100, at(0), at(1))
+    history.note_move(110, at(2))
+    history.note_move(150, at(3))  # while it was lost, and nothing came of it
+    history.reenter(120, at(1))
+    assert [stamp_ns for stamp_ns, _ in history.moves_since(0)] == [110, 121]
