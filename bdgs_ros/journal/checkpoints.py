@@ -96,8 +96,6 @@ class Checkpoints:
         write_images(images, state.images)
         for name in state.images:
             flush(images / name)
-        for folder in {(images / name).parent for name in state.images}:
-            flush(folder)
         document = {**state.document, 'crc32': zlib.crc32(b''.join(state.rows))}
         self._number += 1
         rows = self._folder / f'map-{self._number:06d}.ply'

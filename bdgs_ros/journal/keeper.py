@@ -10,7 +10,7 @@ from collections.abc import Callable
 from bdgs_ros.core.errors import BdgsError
 from bdgs_ros.journal.checkpoints import Checkpoints, State
 
-_LEAST_S = 0.5  # between two states
+_LEAST_S = 1.0  # between two states; with half of it a fast turning camera lost 5 % of its frames
 _SHARE = 0.1  # of a processor, at most; to wait for the disk costs nothing
 
 

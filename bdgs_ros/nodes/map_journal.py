@@ -14,7 +14,10 @@ from bdgs_ros.journal.folder import map_folder, poses_file
 from bdgs_ros.journal.keeper import MapKeeper
 from bdgs_ros.journal.poses import Told, read_told
 from bdgs_ros.mapping.keyframe_store import KeyframeSet
+from bdgs_ros.mapping.keyframes import MapKeyframe
 from bdgs_ros.nodes.map_services import LiveMap
+
+_NICE = 15  # whatever else the machine does comes first
 
 
 class MapJournal:
@@ -38,7 +41,7 @@ class MapJournal:
         self._health = health
         self._keeper: MapKeeper | None = None
         self._checkpoints: Checkpoints | None = None
-        self._kept_version = 0
+        self._kept: MapKeyframe | None = None  # the newest keyframe of the last state
         self._goes_on = False  # with a run that began before this process
         self._since_ns: int | None = None  # the newest keyframe of the map that was taken up
 
@@ -54,7 +57,7 @@ class MapJournal:
         self._keeper = MapKeeper(
             self._checkpoints,
             partial(self._health.set_problem, 'journal'),
-            partial(give_way, self._config.mapping_nice),
+            partial(give_way, _NICE),
         )
         return kept is not None
 
@@ -97,13 +100,15 @@ class MapJournal:
                 self._live.mapper.history.catch_up(self._since_ns, told.moves, told.pieces)
 
     def keep(self) -> None:
-        """Have the map written if it is time, and it has changed; its owner has locked it."""
-        mapper, version = self._live.mapper, self._live.version
+        """Have the map written if it is time, and has a new keyframe; its owner has locked it."""
+        mapper = self._live.mapper
         if self._keeper is None or self._checkpoints is None or not self._keeper.is_due:
             return
-        if version != self._kept_version and mapper.grows and mapper.keyframes:
-            self._kept_version = version
-            self._keeper.put(self._checkpoints.state(mapper.map, mapper.kept()))
+        newest = mapper.keyframes[-1] if mapper.grows and mapper.keyframes else None
+        if newest is not self._kept:
+            self._kept = newest
+            if newest is not None:
+                self._keeper.put(self._checkpoints.state(mapper.map, mapper.kept()))
 
     def part(self) -> None:
         """Take that the world is given up: nothing that was said before is of the next one."""
