@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from functools import partial
+from typing import BinaryIO
 
 from geometry_msgs.msg import PoseStamped, Vector3
 from nav_msgs.msg import Odometry, Path
@@ -16,7 +17,7 @@ from bdgs_ros.bridge.node_config import TrackingNodeConfig
 from bdgs_ros.bridge.optional import TransformPublisher
 from bdgs_ros.core import se3
 from bdgs_ros.core.types import Pose, StampedPose, TrackingResult, Trajectory
-from bdgs_ros.journal.folder import poses_file
+from bdgs_ros.journal.folder import poses_file, use
 from bdgs_ros.journal.poses import PoseJournal, read_told
 from bdgs_ros.tracking.piece import Piece
 
@@ -49,6 +50,7 @@ class PoseOutput:
         self._config = config
         self._poses: list[StampedPose] = []
         self._previous: StampedPose | None = None  # none after a restart
+        self._used: BinaryIO | None = None
         self._journal = self._begin_journal(health)
         self._path_sent_s = 0.0
         self._pose = node.create_publisher(PoseStamped, topics.POSE, topics.RELIABLE)
@@ -68,6 +70,7 @@ class PoseOutput:
         folder = self._config.journal_folder
         if folder is None:
             return None
+        self._used = use(folder)
         if self._config.resume:
             self._poses = read_told(poses_file(folder)).poses
         return PoseJournal(
@@ -97,6 +100,8 @@ class PoseOutput:
         """Have the last poses written."""
         if self._journal is not None:
             self._journal.close()
+        if self._used is not None:
+            self._used.close()
 
     def publish_move(self, stamp_ns: int, T_new_old: Pose) -> None:
         """Say that the poses from a frame on are in a world that has moved."""

@@ -5,11 +5,13 @@ from __future__ import annotations
 import fcntl
 import os
 import shutil
+import time
 from pathlib import Path
 from typing import BinaryIO
 
 from bdgs_ros.core.errors import JournalError
 
+_PATIENCE_S, _POLL_S = 20.0, 0.1
 _MOST = 16  # graphs at once whose journals are in the cache folder
 
 
@@ -49,8 +51,10 @@ class Claim:
 
     def __init__(self, folders: list[Path], *, keep: bool) -> None:
         self.folder, self._lock = _first_free(folders)
-        if not keep:
-            self._empty()
+        with _used_file(self.folder).open('ab') as used:
+            _wait_for(used, self.folder)
+            if not keep:
+                self._empty()
 
     def _empty(self) -> None:
         poses_file(self.folder).unlink(missing_ok=True)
@@ -62,6 +66,38 @@ class Claim:
         self._lock.close()
 
 
+def use(folder: Path) -> BinaryIO:
+    """Say that this process writes into a journal, as long as the file that it gets is open."""
+    folder.mkdir(parents=True, exist_ok=True)
+    used = _used_file(folder).open('ab')
+    fcntl.flock(used, fcntl.LOCK_SH)
+    return used
+
+
+def _used_file(folder: Path) -> Path:
+    return folder / 'used'
+
+
+def _wait_for(used: BinaryIO, folder: Path) -> None:
+    """Wait for nodes that have outlived their slam_node and still save what they have."""
+    deadline = time.monotonic() + _PATIENCE_S
+    while not _is_locked_now(used):
+        if time.monotonic() > deadline:
+            raise JournalError(
+                f"nodes of an earlier graph still write into '{folder}': end them first"
+            )
+        time.sleep(_POLL_S)
+
+
+def _is_locked_now(file: BinaryIO) -> bool:
+    """Take a lock that nobody else has; return whether that went well."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
+
+
 def _first_free(folders: list[Path]) -> tuple[Path, BinaryIO]:
     why = ''
     for folder in folders:
@@ -71,11 +107,8 @@ def _first_free(folders: list[Path]) -> tuple[Path, BinaryIO]:
         except OSError as error:
             why = f"journal folder '{folder}' cannot be made: {error.strerror}"
             continue
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            lock.close()
-            why = f"journal folder '{folder}' is in use by another graph"
-            continue
-        return folder, lock
+        if _is_locked_now(lock):
+            return folder, lock
+        lock.close()
+        why = f"journal folder '{folder}' is in use by another graph"
     raise JournalError(f"{why}; name another with 'output' or 'journal.folder'")

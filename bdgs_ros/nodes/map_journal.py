@@ -5,12 +5,13 @@ from __future__ import annotations
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
+from typing import BinaryIO
 
 from bdgs_ros.bridge.health import Health
 from bdgs_ros.bridge.node_config import MappingNodeConfig
 from bdgs_ros.bridge.priority import give_way
 from bdgs_ros.journal.checkpoints import Checkpoints, read_newest
-from bdgs_ros.journal.folder import map_folder, poses_file
+from bdgs_ros.journal.folder import map_folder, poses_file, use
 from bdgs_ros.journal.keeper import MapKeeper
 from bdgs_ros.journal.poses import Told, read_told
 from bdgs_ros.mapping.keyframe_store import KeyframeSet
@@ -42,6 +43,7 @@ class MapJournal:
         self._keeper: MapKeeper | None = None
         self._checkpoints: Checkpoints | None = None
         self._kept: MapKeyframe | None = None  # the newest keyframe of the last state
+        self._used: BinaryIO | None = None
         self._goes_on = False  # with a run that began before this process
         self._since_ns: int | None = None  # the newest keyframe of the map that was taken up
 
@@ -50,6 +52,7 @@ class MapJournal:
         folder = self._config.journal_folder
         if folder is None:
             return False
+        self._used = use(folder)
         kept = self._take_up(folder) if self._config.resume else None
         self._checkpoints = Checkpoints(map_folder(folder), kept)
         if kept is None and not self._live.mapper.frozen:
@@ -124,3 +127,5 @@ class MapJournal:
         """Write what has changed, and end."""
         if self._keeper is not None:
             self._keeper.close()
+        if self._used is not None:
+            self._used.close()

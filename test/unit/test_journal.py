@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import struct
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -15,8 +16,8 @@ import pytest
 from bdgs_ros.core import se3
 from bdgs_ros.core.errors import JournalError
 from bdgs_ros.core.types import StampedPose
-from bdgs_ros.journal import records, writer
-from bdgs_ros.journal.folder import Claim, poses_file
+from bdgs_ros.journal import folder, records, writer
+from bdgs_ros.journal.folder import Claim, poses_file, use
 from bdgs_ros.journal.poses import PoseJournal, read_told
 from bdgs_ros.journal.records import framed, framed_file, open_at_end, read_records
 
@@ -166,6 +167,21 @@ def test_a_folder_is_of_one_graph(tmp_path: Path) -> None:
     first.remove()
     assert not (tmp_path / 'a').exists()
     Claim([tmp_path / 'a'], keep=True)
+
+
+def test_nodes_that_outlive_their_graph_are_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Claim([tmp_path / 'a'], keep=False)._lock.close()
+    used = use(tmp_path / 'a')
+    threading.Timer(0.3, used.close).start()
+    started = time.monotonic()
+    Claim([tmp_path / 'a'], keep=False)._lock.close()
+    assert time.monotonic() - started > 0.2
+    with use(tmp_path / 'a'):
+        monkeypatch.setattr(folder, '_PATIENCE_S', 0.2)
+        with pytest.raises(JournalError, match='nodes of an earlier graph still write'):
+            Claim([tmp_path / 'a'], keep=True)
 
 
 def test_a_new_run_begins_without_the_old_one(tmp_path: Path) -> None:
