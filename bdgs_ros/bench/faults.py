@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 
 from bdgs_ros.bench import sequences
+from bdgs_ros.bench.columns import median, worst
 from bdgs_ros.bench.harness import Cell, Options
-from bdgs_ros.bench.live import bag_of, children_of, graph_values, run_graph
+from bdgs_ros.bench.live import SHM, bag_of, children_of, graph_values, run_graph
 from bdgs_ros.bench.sequences import REAL
 from bdgs_ros.core import se3
 from bdgs_ros.core.types import Trajectory
@@ -39,7 +40,6 @@ _MIDDLE = (0.25, 0.75)
 _STEP_NS = 200_000_000
 _FAR_M = 0.1
 _PATIENCE_S = 60.0
-_SHM = Path('/dev/shm')
 
 
 def cells(options: Options) -> list[Cell]:
@@ -69,7 +69,7 @@ def run_cell(cell: Cell, options: Options) -> dict[str, Any]:
     seconds = 1e-9 * (sequence.stamps_ns[-1] - sequence.stamps_ns[0])
     after_s = float(np.random.default_rng(cell.seed).uniform(*_MIDDLE)) * seconds
     killer = _Killer(cell.configuration.removeprefix('kill_'), output, after_s)
-    before = set(_SHM.iterdir())
+    before = set(SHM.iterdir())
     values = graph_values(bag, output, options)
     run_graph({**values, 'journal.folder': output / 'journal'}, output / 'log.txt', killer.watch)
     metrics = json.loads((output / 'metrics.json').read_text(encoding='utf-8'))
@@ -85,7 +85,7 @@ def run_cell(cell: Cell, options: Options) -> dict[str, Any]:
         'ate_final_cm': found.get('ate_final_rmse'),
         'gaussians': found.get('gaussians'),
         'ready_s': killer.ready_s(output / 'log.txt'),
-        'left_in_shm': len(set(_SHM.iterdir()) - before),
+        'left_in_shm': len(set(SHM.iterdir()) - before),
     }
     return row | errors_after(truth, online, killer.share)
 
@@ -176,9 +176,7 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     for key in dict.fromkeys((row['sequence'], row['configuration']) for row in rows):
         own = [row for row in rows if (row['sequence'], row['configuration']) == key]
         for column in ('ready_s', 'gap_s', 'missing', 'jump_cm', 'off_cm', 'wrong'):
-            values = [row[column] for row in own if row.get(column) is not None]
-            if values:
-                name = '_'.join((*key, column))
-                summary[name] = float(np.median(values))
-                summary[f'{name}_worst'] = float(max(values))
-    return summary
+            name = '_'.join((*key, column))
+            summary[name] = median(own, column)
+            summary[f'{name}_worst'] = worst(own, column, is_most=True)
+    return {name: value for name, value in summary.items() if value is not None}

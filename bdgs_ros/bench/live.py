@@ -14,6 +14,8 @@ from bdgs_ros.bench import sequences
 from bdgs_ros.bench.harness import Cell, Options
 from bdgs_ros.core.errors import BdgsError
 
+SHM = Path('/dev/shm')
+"""Where Fast DDS has its files; they are looked at."""
 _TIMEOUT_S = 300.0
 _BUSY = f"""
 import time

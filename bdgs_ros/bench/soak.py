@@ -17,7 +17,7 @@ import numpy as np
 
 from bdgs_ros.bench import sequences
 from bdgs_ros.bench.harness import Cell, Options
-from bdgs_ros.bench.live import bag_of, children_of, graph_values, run_graph
+from bdgs_ros.bench.live import SHM, bag_of, children_of, graph_values, run_graph
 from bdgs_ros.bench.sequences import REAL
 
 NAME = 'soak'
@@ -35,7 +35,6 @@ _FAULT_PERIOD_S = 30.0
 _STILL_S = 3.0
 _SAMPLE_S = 1.0
 _WARM_UP = 0.25
-_SHM = Path('/dev/shm')
 _RESULTS = ('trajectory.txt', 'trajectory_final.txt', 'map.ply', 'metrics.json')
 _END_S = 30.0
 
@@ -122,7 +121,7 @@ def disturb(slam_pid: int, fault: str) -> None:
 def sample(slam_pid: int, journal: Path) -> dict[str, float]:
     """Return what a graph uses at the moment; a node that is away is left out."""
     found: dict[str, float] = {
-        'shm_mb': _bytes_in(_SHM) / 1e6,
+        'shm_mb': _bytes_in(SHM) / 1e6,
         'journal_mb': _bytes_in(journal) / 1e6,
     }
     for node in _NODES:

@@ -16,7 +16,7 @@ from dataclasses import replace
 from bdgs_ros.back_end.back_end import BackEnd
 from bdgs_ros.core import se3
 from bdgs_ros.core.types import Keyframe, ModelView, Pose, StampedPose
-from bdgs_ros.mapping.history import Move, moved_between, seen_from
+from bdgs_ros.mapping.history import Move, begun_again, moved_between, seen_from
 from bdgs_ros.mapping.mapper import Mapper
 from bdgs_ros.pipeline import Adjustment, adjust
 
@@ -146,11 +146,10 @@ class Adjuster:
                 self._moves = [*self._moves, (stamp_ns, T_new_old)]
 
     def reenter(self, last_ns: int, T_new_old: Pose) -> None:
-        """Take that tracking began again after a frame, see `History.reenter`."""
+        """Take that tracking began again, see `begun_again`."""
         with self._lock:
             if self._at_once:
-                kept = [move for move in self._moves if move[0] <= last_ns]
-                self._moves = [*kept, (last_ns + 1, T_new_old)]
+                self._moves = begun_again(self._moves, last_ns, T_new_old)
 
     def note_piece(self, first_ns: int, last_ns: int) -> None:
         """Take the time during which a piece of map was made that is part of the world now."""

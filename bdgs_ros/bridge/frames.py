@@ -198,11 +198,7 @@ class FrameSource:
             if stand
             else '',
         )
-        apart = (
-            not silent
-            and self._sync.counts.pairs == 0
-            and self._sync.counts.unpaired_left > _HELD_FOR_INFO
-        )
+        apart = not silent and counts.pairs == 0 and counts.unpaired_left > _HELD_FOR_INFO
         self._health.set_problem(
             'apart',
             f"colour on '{self._names[topics.COLOR]}' and depth on '{self._names[topics.DEPTH]}' "

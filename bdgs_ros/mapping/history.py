@@ -59,6 +59,16 @@ def seen_from(moves: Sequence[Move], first_ns: int, last_ns: int) -> list[Move]:
     return [(first_ns if first_ns < s <= last_ns else s, T_new_old) for s, T_new_old in moves]
 
 
+def begun_again(moves: Sequence[Move], last_ns: int, T_new_old: Pose) -> list[Move]:
+    """
+    Return the moves where tracking began again after a frame, in the world as it is.
+
+    What it had moved since that frame is void.
+    """
+    kept = [move for move in moves if move[0] <= last_ns]
+    return [*kept, (last_ns + 1, T_new_old)]
+
+
 class History:
     """All keyframes that ever were, also those whose images are forgotten."""
 
@@ -129,9 +139,8 @@ class History:
                 self.join(piece)
 
     def reenter(self, last_ns: int, T_new_old: Pose) -> None:
-        """Note that tracking began again, in the world as it is: what it moved since is void."""
-        self._moves = [move for move in self._moves if move[0] <= last_ns]
-        self.note_move(last_ns + 1, T_new_old)
+        """Note that tracking began again, see `begun_again`."""
+        self._moves = begun_again(self._moves, last_ns, T_new_old)
 
     def moves_since(self, stamp_ns: int) -> list[Move]:
         """Return by what tracking moved its world after a frame."""

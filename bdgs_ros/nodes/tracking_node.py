@@ -156,9 +156,19 @@ class TrackingNode(GraphNode):
         if len(self._output.trajectory):
             self.get_logger().warning(f'another world begins: {why}')
         self._feedback.goes_on = False
+        self._leave_world()
+
+    def _leave_world(self) -> None:
+        """Give up the trajectory and what is known of places, and have the others forget."""
         self._feedback.forget_map()
+        self._forget_places()
         self._output.clear()
         self._reset_event.publish(Empty())
+
+    def _forget_places(self) -> None:
+        """Give up places that the tracker does not know yet, and those that are being read."""
+        self._world += 1
+        self._late_places = []
 
     def _read_places(self, world: int) -> None:
         try:
@@ -238,12 +248,8 @@ class TrackingNode(GraphNode):
 
     def _give_up_for(self, piece: Piece) -> None:
         """Begin anew with a piece of map, all of which was seen since the camera was lost."""
-        self._feedback.forget_map()
         self._feedback.clear()
-        self._world += 1
-        self._late_places = []
-        self._output.clear()
-        self._reset_event.publish(Empty())
+        self._leave_world()
         self._tracker.start_from(piece.entrance())
 
     def _tell_joined(self) -> None:
@@ -320,8 +326,7 @@ class TrackingNode(GraphNode):
         self.get_logger().info('reset: the next frame is the origin')
 
     def _start_over(self) -> None:
-        self._world += 1
-        self._late_places = []
+        self._forget_places()
         self._tracker.reset()
         self._explorer.reset()
         self._joined = []

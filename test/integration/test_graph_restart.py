@@ -41,6 +41,13 @@ def wait_for_poses(slam: Running, journal: Path, count: int) -> list[StampedPose
     return poses
 
 
+def finished(slam: Running, output: Path) -> tuple[Trajectory, Trajectory]:
+    """Wait for a good end, and return the trajectories that it left, online and final."""
+    assert slam.wait(120.0) == 0, slam.text()
+    online, final = (read_trajectory(output / f'trajectory{end}.txt') for end in ('', '_final'))
+    return online, final
+
+
 def check_one_world(online: Trajectory, truth: Trajectory, at_once_s: float = 0.5) -> None:
     """All poses are right in one frame, and none jumps against the one before."""
     known = [(truth.poses[g], online.poses[e]) for g, e in zip(*associate(truth, online))]  # noqa: B905
@@ -62,14 +69,13 @@ def test_a_node_that_is_killed_goes_on_in_the_same_world(
     before = wait_for_poses(slam, output / 'journal', 6)
     (pid,) = (pid for pid, line in children(slam).items() if f'{node}_node' in line)
     os.kill(pid, signal.SIGKILL)
-    assert slam.wait(120.0) == 0, slam.text()
+    online, final = finished(slam, output)
     assert f'{node}_node ended with status -9; starting it again' in slam.text()
     assert 'Traceback' not in slam.text()
 
     sequence = BagSequence(bag)
     truth = sequence.ground_truth
     assert truth is not None
-    online, final = (read_trajectory(output / f'trajectory{end}.txt') for end in ('', '_final'))
     assert {pose.stamp_ns for pose in before} <= set(online.stamps_ns.tolist())
     assert online.stamps_ns[-1] == sequence.stamps_ns[-1], slam.text()
     check_one_world(online, truth)
@@ -100,9 +106,8 @@ def test_a_run_is_gone_on_with_after_a_power_cut(
         'slam_node', bag=bag, output=output, rate=RATE, start=start_s, resume=True,
         exit_at_end=True, **settings,
     )  # fmt: skip
-    assert again.wait(120.0) == 0, again.text()
+    online, final = finished(again, output)
     assert f'going on with {len(told)} poses' in again.text()
-    online, final = (read_trajectory(output / f'trajectory{end}.txt') for end in ('', '_final'))
     stamps = online.stamps_ns.tolist()
     assert stamps[: len(told)] == [pose.stamp_ns for pose in told]
     assert stamps[-1] == sequence.stamps_ns[-1]

@@ -65,8 +65,10 @@ def test_growth_is_a_slope_after_the_warm_up() -> None:
 
 def test_children_are_found_by_their_module_and_sampled(tmp_path: Path) -> None:
     (tmp_path / 'some').write_bytes(bytes(2_000_000))
-    command = [sys.executable, '-c', 'input()', 'bdgs_ros.nodes.mapping_node']
-    with subprocess.Popen(command, stdin=subprocess.PIPE) as child:
+    code = 'print(flush=True); input()'  # it runs, and is not still the process it came from
+    command = [sys.executable, '-c', code, 'bdgs_ros.nodes.mapping_node']
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
+        assert child.stdout is not None and child.stdout.readline()
         assert child.pid in children_of(os.getpid(), 'bdgs_ros.nodes.mapping_node')
         found = soak.sample(os.getpid(), tmp_path)
         assert found['mapping_mb'] > 1 and found['mapping_files'] >= 3

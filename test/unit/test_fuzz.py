@@ -9,7 +9,8 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -68,6 +69,17 @@ def spoilt(draw: Callable, data: bytes) -> bytes:
         spoilt[draw(st.integers(0, len(spoilt) - 1))] = draw(st.integers(0, 255))
     end = draw(st.one_of(st.none(), st.integers(0, len(spoilt))))
     return bytes(spoilt[:end]) + draw(st.sampled_from([b'', b'\0' * 7, b'more']))
+
+
+@contextmanager
+def replaced(file: Path, data: bytes) -> Iterator[None]:
+    """Have other bytes in a file for a while."""
+    whole = file.read_bytes()
+    file.write_bytes(data)
+    try:
+        yield
+    finally:
+        file.write_bytes(whole)
 
 
 def read_or_refused(read: Callable[[], object]) -> object:
@@ -177,12 +189,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @given(data=st.data())
 def test_lists_of_images(folder: Path, data: st.DataObject) -> None:
     file = folder / data.draw(st.sampled_from(['rgb.txt', 'depth.txt']))
-    whole = file.read_bytes()
-    file.write_bytes(data.draw(spoilt(whole)))
-    try:
+    with replaced(file, data.draw(spoilt(file.read_bytes()))):
         read_or_refused(lambda: _run_through(folder))
-    finally:
-        file.write_bytes(whole)
 
 
 def _run_through(path: Path) -> int:
@@ -200,12 +208,8 @@ def bag(folder: Path) -> Path:
 @given(data=st.data())
 def test_bags(bag: Path, data: st.DataObject) -> None:
     file = data.draw(st.sampled_from(sorted(path for path in bag.iterdir() if path.is_file())))
-    whole = file.read_bytes()
-    file.write_bytes(data.draw(spoilt(whole)))
-    try:
+    with replaced(file, data.draw(spoilt(file.read_bytes()))):
         read_or_refused(lambda: _run_through(bag))
-    finally:
-        file.write_bytes(whole)
 
 
 @pytest.fixture(scope='module')
@@ -236,30 +240,23 @@ def test_maps(saved: Path, data: st.DataObject) -> None:
     whole = saved.read_bytes()
     head = whole.index(b'end_header')
     in_head = spoilt(whole[:head]).map(lambda changed: changed + whole[head:])
-    saved.write_bytes(data.draw(st.one_of(spoilt(whole), in_head)))
-    try:
+    with replaced(saved, data.draw(st.one_of(spoilt(whole), in_head))):
         read_or_refused(lambda: _load(saved))
-    finally:
-        saved.write_bytes(whole)
 
 
 @many
 @given(data=st.data())
 def test_transforms_of_keyframes(saved: Path, data: st.DataObject) -> None:
     file = keyframe_folder(saved) / TRANSFORMS
-    whole = file.read_text()
-    document = json.loads(whole)
+    document = json.loads(file.read_text())
     within = data.draw(
         st.sampled_from(
             [document, document['bdgs'], document['bdgs']['history'], document['frames'][0]]
         )
     )
     within[data.draw(st.sampled_from(sorted(within)))] = data.draw(plain)
-    file.write_text(json.dumps(document))
-    try:
+    with replaced(file, json.dumps(document).encode()):
         read_or_refused(lambda: _load(saved))
-    finally:
-        file.write_text(whole)
 
 
 @many
@@ -267,13 +264,9 @@ def test_transforms_of_keyframes(saved: Path, data: st.DataObject) -> None:
 def test_states_of_the_journal(saved: Path, data: st.DataObject) -> None:
     folder = saved.parent / 'journal'
     file = data.draw(st.sampled_from(sorted(p for p in folder.rglob('*') if p.is_file())))
-    whole = file.read_bytes()
-    file.write_bytes(data.draw(spoilt(whole)))
-    try:
+    with replaced(file, data.draw(spoilt(file.read_bytes()))):
         found = read_newest(folder, CONFIG.belief, CONFIG.mapping)
         assert found is None or file.suffix == '.png' or len(found[0])
-    finally:
-        file.write_bytes(whole)
 
 
 @many

@@ -11,19 +11,17 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from test_map_files import CAMERA, SECOND, a_frame
 
 from bdgs_ros.core import se3
-from bdgs_ros.core.camera import PinholeCamera
 from bdgs_ros.core.config import BdgsConfig, with_values
-from bdgs_ros.core.types import Keyframe, RgbdFrame, StampedPose, Trajectory
+from bdgs_ros.core.types import Keyframe, StampedPose, Trajectory
 from bdgs_ros.journal import checkpoints, keeper
 from bdgs_ros.journal.checkpoints import Checkpoints, read_newest, read_places
 from bdgs_ros.journal.keeper import MapKeeper
 from bdgs_ros.mapping.history import History
 from bdgs_ros.mapping.mapper import Mapper
 
-CAMERA = PinholeCamera(64, 48, 60.0, 61.0, 31.7, 23.2)
-SECOND = 1_000_000_000
 CONFIG = with_values(
     BdgsConfig(), {'mapping.iterations': 2, 'mapping.threads': 1, 'mapping.keyframes': 6}
 )
@@ -34,15 +32,7 @@ def at(i: int) -> np.ndarray:
 
 
 def a_keyframe(i: int) -> Keyframe:
-    """A striped wall at z = 2 m."""
-    T = at(i)
-    rays = CAMERA.rays() @ T[:3, :3].T
-    scale = (2.0 - T[2, 3]) / rays[..., 2]
-    points = rays * scale[..., None] + T[:3, 3]
-    pattern = 0.5 + 0.4 * np.sin(9 * points[..., :1]) * np.cos(7 * points[..., 1:2])
-    color = np.concatenate([pattern, 1 - pattern, pattern**2], axis=-1)
-    frame = RgbdFrame(i * SECOND, (255 * color).astype(np.uint8), scale.astype(np.float32), CAMERA)
-    return Keyframe(frame, T, np.zeros(CAMERA.shape, np.uint8))
+    return Keyframe(a_frame(i * SECOND, at(i)), at(i), np.zeros(CAMERA.shape, np.uint8))
 
 
 @pytest.fixture
